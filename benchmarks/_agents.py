@@ -137,7 +137,7 @@ def density_of(
 
 
 def directly(env: Env, seed: int) -> Answer:
-    """emcee on the calls: each density is one. Chance is that of the response surface, in call and observation."""
+    """emcee on the calls: each density is one. Scatter is that of the response surface, in call and observation."""
     surface, n, budget = env.unwrapped.problem.surface, env.action_space.shape[0], env.unwrapped.budget  # type: ignore
     inverse = np.linalg.pinv(surface.patches @ surface.factor)
     env.reset(seed=seed)

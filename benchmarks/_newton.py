@@ -15,6 +15,7 @@ from splatsoil.benchmarks._common import FloatArray
 
 from splatsoil.errors import RunError, SimulationError
 from splatsoil.measurement import Measurement
+from splatsoil.mpm import Resolution, Trajectory
 from splatsoil.mpm.simulate import step_poses
 from splatsoil.soil.matching import cone_intercept, cone_slope
 
@@ -90,19 +91,6 @@ class Soil:
         return (self.measurement.bed.density * self.spacing**3 * gravity).astype(np.float32)
 
 
-@dataclass(frozen=True)
-class Run:
-    """What became of soil.
-
-    Attributes:
-        particles: (n, 3) in m, by frame.
-        force: (f, 3) of the soil on the tool in N: mean over the time that leads to frames 1, 2, …, f.
-    """
-
-    particles: dict[int, FloatArray]
-    force: FloatArray
-
-
 def load_newton() -> Any:
     """The package; RunError when it isn't installed."""
     try:
@@ -119,19 +107,19 @@ def plough(
     *,
     begin: int = 0,
     progress: Callable[[int, int], None] = lambda frame, last: None,
-) -> list[Run]:
+) -> list[Trajectory]:
     """Plough soils side by side, each in a box of its own, to the last frame.
 
     Args:
         soils: with their beds, tools and motions.
         numerics: of the solver.
-        frames: to keep, of those after the first.
+        frames: to keep, besides the first.
         device: Warp device name.
         begin: frame at which the soils' particles rest and the run begins.
         progress: called with (frame, last frame) after each.
 
     Returns:
-        What became of each soil.
+        A trajectory of each soil, whose particles do not deform.
 
     Raises:
         RunError: the ``newton`` package is missing, or the soils' floors or frame rates differ.
@@ -160,7 +148,7 @@ def plough(
     step = frame_time / numerics.substeps
     wanted = sorted(f for f in frames if f > begin)
     ends = np.cumsum([len(w.particles) for w in soils])[:-1]
-    found: list[dict[int, FloatArray]] = [{} for _ in soils]
+    found = [[soil.particles] for soil in soils]
     force = np.zeros((len(soils), wanted[-1], 3))
     for frame in range(begin + 1, wanted[-1] + 1):
         start = (frame - 1) * frame_time
@@ -183,10 +171,20 @@ def plough(
             x = now.particle_q.numpy().astype(np.float64)
             if not np.isfinite(x).all():
                 raise SimulationError(f"newton: particles are no numbers at frame {frame} with {numerics}")
-            for k, part in enumerate(np.split(x, ends)):
-                found[k][frame] = part - shifts[k]
+            for kept, part, shift in zip(found, np.split(x, ends), shifts, strict=True):
+                kept.append(part - shift)
         progress(frame, wanted[-1])
-    return [Run(particles, each) for particles, each in zip(found, force, strict=True)]
+    return [
+        Trajectory(
+            frames=(begin, *wanted),
+            positions=np.array(kept, dtype=np.float32),
+            deformations=np.broadcast_to(np.eye(3, dtype=np.float32), (len(kept), len(kept[0]), 3, 3)),
+            force=pushed,
+            spacing=soil.spacing,
+            resolution=Resolution.derive(soil.measurement, "small"),
+        )
+        for kept, pushed, soil in zip(found, force, soils, strict=True)
+    ]
 
 
 def _impulses(solver: Any, state: Any, bodies: int) -> FloatArray:

@@ -92,7 +92,7 @@ class Scene:
 
 
 def draw(rng: np.random.Generator, bed: str, tool: tuple[str, float, float]) -> Scene:
-    """A scene with the bed and the tool that are given; everything else by chance."""
+    """A scene with the bed and the tool that are given; everything else at random."""
     kind, width, tilt = tool
     ranges = (ANGLES, DENSITIES, SLOPES, (0.0, 360.0), DEPTHS[kind], ROLLING)
     angle, density, slope, towards, depth, rolling = (float(rng.uniform(*limits)) for limits in ranges)

@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +13,10 @@ import torch
 from scipy.ndimage import gaussian_filter
 from splatsoil.benchmarks._common import FloatArray
 
-from splatsoil.errors import MeasurementError, ParameterError
+from splatsoil.errors import MeasurementError
 from splatsoil.experiment.scene_parts import heading_of, stages_of
-from splatsoil.files import plain, read_npz, write_npz
 from splatsoil.measurement import Measurement
-from splatsoil.reconstruction import HeightField, Reconstruction, fill, reconstruct
+from splatsoil.reconstruction import HeightField, fill
 from splatsoil.scene import relief_of_particles
 
 CELL = 0.01
@@ -28,8 +26,6 @@ PATCH = 1.5
 SETTLED = 2.0e-3
 """Change of a patch's height below which its soil counts as neither cut nor heaped, m: three times the scatter between
 particle seeds, which would else fill a bed of 0.4 m² with a hundred cm³ of both."""
-SCALE = 1.25e-5
-"""Step of stored positions, m."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +54,7 @@ class Truth:
         measurement = Measurement.load(folder)
         try:
             truth = json.loads((folder / "truth.json").read_text())
-            particles, spacing = _read(folder / "truth_particles.npz")
+            particles, spacing = read_particles(folder / "truth_particles.npz")
         except OSError as error:
             raise MeasurementError("the benchmark needs true particles", file=folder) from error
         if "parameters" in truth:  # a set of ours
@@ -110,45 +106,14 @@ class Truth:
         x, y = (bed.lower[k] + CELL * (np.arange(height.shape[1 - k]) + 0.5) for k in (0, 1))
         return fill(HeightField(x, y, height), bed, spacing, seed=seed)
 
-    def save(self, file: Path, about: Mapping[str, Any]) -> None:
-        """Particles as a set stores them, with the force and, as JSON, what is simulated."""
-        origin = np.floor(100.0 * np.min([x.min(axis=0) for x in self.particles.values()], axis=0)) / 100.0
-        reach = max(float((x - origin).max()) for x in self.particles.values())
-        scale = SCALE * max(1.0, np.ceil(reach / (SCALE * np.iinfo(np.uint16).max)))
-        stored = {f"f{f:03d}": np.round((x - origin) / scale).astype(np.uint16) for f, x in self.particles.items()}
-        assert self.force is not None
-        force, words = self.force.astype(np.float32), json.dumps(plain(about))
-        write_npz(file, scale=scale, origin=origin, spacing=self.spacing, force=force, about=words, **stored)
 
-    @classmethod
-    def saved(cls, file: Path, about: Mapping[str, Any], like: Truth) -> Truth:
-        """What :meth:`save` wrote, with ``like``'s measurement, values and effects.
-
-        Raises:
-            ParameterError: the file contains something else.
-        """
-        stored = read_npz(file, ["about", "force"])
-        if json.loads(str(stored["about"])) != json.loads(json.dumps(plain(about))):
-            raise ParameterError(f"{file}: holds another scene or other numerics; choose another --out")
-        particles, spacing = _read(file)
-        force = stored["force"].astype(np.float64)
-        return cls(like.measurement, particles, spacing**3, like.values, like.effects, force)
-
-
-def _read(file: Path) -> tuple[dict[int, FloatArray], float]:
+def read_particles(file: Path) -> tuple[dict[int, FloatArray], float]:
     """Positions (n, 3) in m by frame, and the particles' spacing in m."""
     with np.load(file) as stored:
         low = stored["origin"] if "origin" in stored.files else 0.0
         scale = float(stored["scale"])
         particles = {int(k[1:]): stored[k] * scale + low for k in stored.files if k[1:].isdigit()}
         return particles, float(stored["spacing"])
-
-
-def reconstructed(measurement: Measurement, folder: Path, preset: str, device: str) -> Reconstruction:
-    """A measurement set's reconstruction, from the folder or made and kept there."""
-    if not (folder / "reconstruction.json").is_file():
-        reconstruct(measurement, preset=preset, device=device).save(folder)
-    return Reconstruction.load(folder)
 
 
 def in_patches(difference: FloatArray) -> float:

@@ -17,7 +17,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +38,9 @@ from splatsoil.benchmarks._newton import Numerics, plough
 
 from splatsoil.errors import ParameterError
 from splatsoil.files import plain, read_json
-from splatsoil.mpm import PRESETS, Resolution, Trajectory, frames_around, simulate
+from splatsoil.mpm import PRESETS, frames_around
 from splatsoil.quiet import hush
-from splatsoil.reconstruction import fill
-from splatsoil.soil.law import Law
-from splatsoil.soil.library import find_effects
-from splatsoil.synthetic import Appearance, Recorder, Setup, photograph_run
+from splatsoil.synthetic import Appearance, Recipe, Recorder, make_set, photograph_run
 
 OWN = ("_hidden", "_newton", "_scenes", "hidden_worlds")
 """Modules beside the package by which the experiments are made."""
@@ -54,38 +51,6 @@ ELSE = "something else"
 OPEN = (ELSE, "undecided")
 LEAST = 1e-6
 """Probability from which on down the log score falls no further."""
-
-
-def ploughed_by_newton(
-    group: Sequence[Hidden], setups: Sequence[Setup], frames: Sequence[int], device: str
-) -> list[Trajectory]:
-    """Synthetic experiments side by side."""
-    numerics = Numerics()
-    soils = [hidden.soil(setup, numerics.spacing) for hidden, setup in zip(group, setups, strict=True)]
-    found = []
-    for setup, soil, run in zip(setups, soils, plough(soils, numerics, frames, device), strict=True):
-        positions = np.stack([soil.particles, *(run.particles[f] for f in frames if f > 0)]).astype(np.float32)
-        found.append(
-            Trajectory(
-                frames=tuple(frames),
-                positions=positions,
-                deformations=np.broadcast_to(np.eye(3, dtype=np.float32), (*positions.shape, 3)),
-                force=run.force[: max(setup.frames)],
-                spacing=soil.spacing,
-                resolution=Resolution.derive(setup.experiment(), "small"),
-            )
-        )
-    return found
-
-
-def ploughed_by_us(hidden: Hidden, setup: Setup, frames: Sequence[int], preset: str, device: str) -> Trajectory:
-    """A synthetic experiment of our own solver, of particles that no fit starts from."""
-    experiment = setup.experiment()
-    law = Law(effect.for_measurement(experiment) for effect in find_effects(hidden.effects))
-    resolution = Resolution.derive(experiment, preset)
-    x = fill(setup.surface, setup.bed, resolution.spacing, seed=hidden.scene.seed)
-    values = law.require_on({**hidden.values, "friction_angle": hidden.angle})
-    return simulate(experiment, x, values, law=law, resolution=resolution, frames=frames, device=device)[0]
 
 
 @dataclass(frozen=True)
@@ -100,48 +65,57 @@ class Study:
 
     def made(self, truths: Sequence[Hidden], side_by_side: int) -> Iterator[Hidden]:
         """Simulate and photograph the experiments that the folder lacks, so many at a time; each that is there."""
-        missing = [h for h in truths if not (self.out / "sets" / h.name / "truth.json").is_file()]
+        missing = [h for h in truths if not (self.folder(h) / "truth.json").is_file()]
         yield from (h for h in truths if h not in missing)
+        make = self.by_newton if self.solver == NEWTON else self.by_ours
         groups = [missing[k : k + side_by_side] for k in range(0, len(missing), side_by_side)]
         while groups:
             group = groups.pop(0)
-            setups, seen = [h.scene.setup() for h in group], [h.observation() for h in group]
-            rate = setups[0].frame_rate
-            frames = sorted({f for o in seen for f in frames_around(setups[0].frames, o.time_offset * rate)})
-            if self.solver == NEWTON:
-                try:
-                    runs = ploughed_by_newton(group, setups, frames, self.device)
-                except ValueError as error:  # a particle that flies off asks for a grid of any size
-                    self.say(f"{', '.join(h.name for h in group)}: the other solver failed ({error})")
-                    groups += [[hidden] for hidden in group if len(group) > 1]
-                    continue
+            names = ", ".join(hidden.name for hidden in group)
+            try:
+                make(group)
+            except ValueError as error:  # a particle that flies off makes Newton ask for a grid of any size
+                self.say(f"{names}: the other solver failed ({error})")
+                groups += [[hidden] for hidden in group if len(group) > 1]
             else:
-                ours = zip(group, setups, strict=True)
-                runs = [ploughed_by_us(h, setup, frames, self.solver, self.device) for h, setup in ours]
-            for each in zip(group, setups, runs, strict=True):
-                self.photograph(*each)
-                yield each[0]
+                self.say(f"{names}: simulated and photographed")
+                yield from group
 
-    def photograph(self, hidden: Hidden, setup: Setup, run: Trajectory) -> None:
-        """Make the measurement set, with its truth."""
-        solver = asdict(Numerics()) if self.solver == NEWTON else self.solver
-        truth, seed = {"hidden": hidden.kind, "values": hidden.values, "solver": solver}, hidden.scene.seed
-        recorder = Recorder(setup, run, Appearance.drawn(seed), seed, self.device, hidden.observation())
-        photograph_run(self.out / "sets" / hidden.name, recorder, plain({**truth, "scene": asdict(hidden.scene)}))
-        self.say(f"{hidden.name} simulated and photographed")
+    def by_newton(self, group: Sequence[Hidden]) -> None:
+        """Make the measurement sets of experiments that Newton ploughs side by side."""
+        setups, seen = [h.scene.setup() for h in group], [h.observation() for h in group]
+        rate = setups[0].frame_rate
+        frames = {f for o in seen for f in frames_around(setups[0].frames, o.time_offset * rate)}
+        soils = [h.soil(setup, Numerics().spacing) for h, setup in zip(group, setups, strict=True)]
+        runs = plough(soils, Numerics(), frames, self.device)
+        for hidden, setup, run, observation in zip(group, setups, runs, seen, strict=True):
+            filmed, seed = replace(run, force=run.force[: max(setup.frames)]), hidden.scene.seed
+            recorder = Recorder(setup, filmed, Appearance.drawn(seed), seed, self.device, observation)
+            photograph_run(self.folder(hidden), recorder, plain({**asdict(hidden), "solver": asdict(Numerics())}))
+
+    def by_ours(self, group: Sequence[Hidden]) -> None:
+        """The same by our own solver, of particles that no fit starts from."""
+        for hidden in group:
+            seed, values = hidden.scene.seed, hidden.values
+            recipe = Recipe(hidden.angle, hidden.effects, values, self.solver, seed, seed, self.device)
+            make_set(self.folder(hidden), hidden.scene.setup(), recipe)
+
+    def folder(self, hidden: Hidden) -> Path:
+        """The measurement set."""
+        return self.out / "sets" / hidden.name
 
     def run(self, hidden: Hidden) -> Path:
         """The run folder."""
         return self.out / "runs" / hidden.name
 
     def judge(self, hidden: Hidden) -> None:
-        """Fit and diagnose by the command line, unless that is done; what it says is kept beside its run."""
+        """Fit and diagnose by the command line, unless that is done; its output is kept beside the run."""
         run = self.run(hidden)
         if (run / "diagnosis.json").is_file():
             return
         run.mkdir(parents=True, exist_ok=True)
         commands = (
-            ["fit", str(self.out / "sets" / hidden.name), "--run", str(run), "--preset", self.preset],
+            ["fit", str(self.folder(hidden)), "--run", str(run), "--preset", self.preset],
             ["diagnose", str(run)],
         )
         with run.with_suffix(".log").open("a") as log:
@@ -158,29 +132,29 @@ class Study:
         return [score(h, read_json(self.run(h) / "fit.json"), read_json(self.run(h) / "diagnosis.json")) for h in there]
 
 
-def score(hidden: Hidden, fit: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any]:
+def score(hidden: Hidden, fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any]:
     """What fit and diagnosis report of a synthetic experiment, beside the truth.
 
     ``size`` is that of the effect's parameter, ``times`` and ``detectable`` are over its smallest meaningful change.
     """
-    models = {model["name"]: model for model in told["models"]}
+    models = {model["name"]: model for model in diagnosis["models"]}
     truth = {NOTHING: "", **dict.fromkeys(OUTSIDE, ELSE)}.get(hidden.kind, hidden.kind)
-    best, angle, verdict = told["models"][0], told["estimates"]["friction_angle"], told["verdict"]
-    named = told["class"] if verdict in ("missing", "one of") else []
+    best, angle, verdict = diagnosis["models"][0], diagnosis["estimates"]["friction_angle"], diagnosis["verdict"]
+    named = diagnosis["class"] if verdict in ("missing", "one of") else []
     row = {
         "hidden": hidden.kind,
         "truth": truth,
         "size": next(iter(hidden.values.values()), 0.0),
         "angle": hidden.angle,
         "verdict": verdict,
-        "class": told["class"],
+        "class": diagnosis["class"],
         "named": named,
         "right": truth in {"adequate": [""], ELSE: [ELSE]}.get(verdict, named),
         "best": best["name"],
         "probabilities": {name: model["probability"] for name, model in models.items()},
         "angle_found": [angle["value"], angle["std"]],
         "z": (angle["value"] - hidden.angle) / angle["std"],
-        "seconds": [fit["seconds"], told["seconds"]],
+        "seconds": [fit["seconds"], diagnosis["seconds"]],
     }
     if hidden.effects and truth in models:
         model = models[truth]
@@ -200,11 +174,11 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     lines = []
     for r in sorted(rows, key=lambda r: (r["right"], r["hidden"])):
         size = f"{r['size']:.3g}" + (f" ({r['times']:.1f})" if "times" in r else "") if r["truth"] else "–"
-        chances = f"{_chance(r, [r['truth']]):.2f}, {_chance(r, ['']):.2f}"
+        shares = f"{_probability(r, [r['truth']]):.2f}, {_probability(r, ['']):.2f}"
         angle = f"{r['angle']:.1f}°; {r['angle_found'][0]:.1f} ± {r['angle_found'][1]:.1f}° ({r['z']:+.1f})"
         found = "{:.3g} ± {:.2g}".format(*r["size_found"]) if "size_found" in r else "–"
         seconds = "{:.0f}, {:.0f} s".format(*r["seconds"])
-        lines.append([r["hidden"], size, r["verdict"], ", ".join(r["class"]) or "–", chances, angle, found, seconds])
+        lines.append([r["hidden"], size, r["verdict"], ", ".join(r["class"]) or "–", shares, angle, found, seconds])
     return markdown(head, lines) + "\n\n" + "\n".join(f"- {line}" for line in _counts(rows))
 
 
@@ -226,15 +200,15 @@ def _counts(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         yield from _rms(f"{what}: error of the angle, degrees", [r["angle_found"][0] - r["angle"] for r in some])
         yield from _rms(f"{what}: error of the angle over its ±", [r["z"] for r in some])
     yield from _rms("relative error of the size", [r["size_error"] for r in rows if "size_error" in r])
-    for what, told in (
+    for what, claims in (
         ("effects named", [(r, r["named"]) for r in rows if r["named"]]),
         ("the most probable model", [(r, [r["best"]]) for r in rows]),
     ):
-        mean = np.mean([_chance(*each) for each in told]) if told else math.nan
-        right = [r["truth"] in names for r, names in told]
+        mean = np.mean([_probability(*each) for each in claims]) if claims else math.nan
+        right = [r["truth"] in names for r, names in claims]
         yield from _share(f"{what}, of probability {mean:.2f} on average: right", right)
     if rows:
-        scores = [math.log(max(_chance(r, [r["truth"]]), LEAST)) for r in rows]
+        scores = [math.log(max(_probability(r, [r["truth"]]), LEAST)) for r in rows]
         yield f"log score of the true model, mean: {np.mean(scores):.2f}"
 
 
@@ -249,7 +223,7 @@ def _rms(what: str, values: Sequence[float]) -> Iterator[str]:
         yield f"{what}, root mean square of {len(values)}: {np.sqrt(np.mean(np.square(values))):.2f}"
 
 
-def _chance(row: Mapping[str, Any], names: Iterable[str]) -> float:
+def _probability(row: Mapping[str, Any], names: Iterable[str]) -> float:
     """Probability that one of these models is true; 0 for one that was not compared."""
     return float(sum(row["probabilities"].get(name, 0.0) for name in names))
 

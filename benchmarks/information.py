@@ -33,7 +33,8 @@ from splatsoil.benchmarks._common import (
     tell,
     with_section,
 )
-from splatsoil.benchmarks._truth import CELL, Truth, reconstructed
+from splatsoil.benchmarks._truth import CELL, Truth
+from splatsoil.envs.measured import reconstructed
 from splatsoil.inverse.criticism.design import Prior
 from splatsoil.inverse.criticism.diagnosis import BASE_RUNS, FINE, OBSERVATION_STEP, PAIRS
 from splatsoil.inverse.criticism.noise import Noise, Tables, noise_of, trend_of
@@ -52,7 +53,7 @@ from splatsoil.quiet import hush
 from splatsoil.soil.library import library
 from splatsoil.synthetic import Recipe, make_set, plow
 
-ANGLE, WORLD = 35.0, 1
+ANGLE, SEED = 35.0, 1
 """Of the soil, degrees, and the seed of its surface, its looks and the cameras' noise."""
 TRUTH = {"friction_angle": ANGLE}
 HEIGHT = "height"
@@ -145,12 +146,12 @@ def simulated(
     def made(runs: Sequence[Run], *allowed: type[Exception]) -> tuple[Sequence[Run], FloatArray]:
         kept, tables = list[Run](), list[FloatArray]()
         for r in runs:
-            told = f"{type(experiment).__name__}: {', '.join(r.effects) or r.variant or 'base'}"
+            text = f"{type(experiment).__name__}: {', '.join(r.effects) or r.variant or 'base'}"
             with suppress(*allowed):
-                tables.append(ask(r, told))
+                tables.append(ask(r, text))
                 kept.append(r)
         if len(kept) < len(runs):
-            print(f"{told}: {len(kept)} of {len(runs)} could be simulated", file=sys.stderr)
+            print(f"{text}: {len(kept)} of {len(runs)} could be simulated", file=sys.stderr)
         return kept, np.array(tables).reshape(len(kept), *experiment.layout.shape)
 
     def spread(count: int, first: int, variant: str = "") -> list[Run]:
@@ -221,11 +222,11 @@ def table(rows: Iterable[Mapping[str, Any]]) -> str:
     lines = []
     for row in sorted(rows, key=lambda row: ("soil" not in row["sigmas"], -row["loss"])):
         hidden = {name: value < row["least"][name] for name, value in row["sigmas"].items()}
-        told = {n: f"< {row['least'][n]:.1f} σ" if hidden[n] else f"{v:.1f} σ" for n, v in row["sigmas"].items()}
+        text = {n: f"< {row['least'][n]:.1f} σ" if hidden[n] else f"{v:.1f} σ" for n, v in row["sigmas"].items()}
         loss, most = f"{'≥ ' * hidden['discretisation']}{row['loss']:.1f}", max(row["factors"], key=row["factors"].get)
         unit = "" if row["unit"] == "1" else " " + row["unit"].replace("deg", "°")
         cells = [f"{row['effect'].replace('_', ' ')}, {row['value']:g}{unit}"]
-        cells += [told.get(name, "–") for name in ("soil", "drawn", "reconstructed", "discretisation")]
+        cells += [text.get(name, "–") for name in ("soil", "drawn", "reconstructed", "discretisation")]
         cells += ["–", "–"] if next(iter(hidden.values())) else [loss, f"{most}: {row['factors'][most]:.1f}"]
         lines.append(cells)
     return markdown(head, lines)
@@ -235,10 +236,10 @@ def measure(effects: Sequence[str], preset: str, seeds: int, device: str, out: P
     """`left` of the effects of these names, or of all; what is not in the folder is made."""
     place, say = out / "set", Clock()
     if not (place / "truth.json").is_file():
-        make_set(place, plow(WORLD), Recipe(ANGLE, preset=preset, seed=WORLD, device=device))
+        make_set(place, plow(SEED), Recipe(ANGLE, preset=preset, seed=SEED, device=device))
     measurement = Measurement.load(place)
     reconstruction = reconstructed(measurement, out / "reconstruction", preset, device)
-    known = replace(reconstruction, surface=plow(WORLD).surface)
+    known = replace(reconstruction, surface=plow(SEED).surface)
     prepared: list[Any] = []
     for kind, start in ((TrueSoil, known), (PlowExperiment, reconstruction)):
         experiment = kind(Model(measurement, start, preset=preset, device=device), TRUTH)

@@ -37,9 +37,8 @@ from splatsoil.benchmarks._common import (
     stamp,
     tell,
 )
-from splatsoil.benchmarks._truth import reconstructed
 from splatsoil.benchmarks.bo_vs_mcmc import accuracy, scored
-from splatsoil.envs.measured import MeasuredProblem
+from splatsoil.envs.measured import MeasuredProblem, reconstructed
 from splatsoil.envs.plow_sand import PlowSandEnv
 from splatsoil.envs.problem import Evaluation, Problem
 from splatsoil.inverse.bayesopt import BayesianOptimiser

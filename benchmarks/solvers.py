@@ -27,15 +27,24 @@ from splatsoil.benchmarks._common import Clock, FloatArray, at_least, markdown, 
 from splatsoil.benchmarks._hidden import NOTHING, Hidden
 from splatsoil.benchmarks._newton import Numerics, plough
 from splatsoil.benchmarks._scenes import Scene, scenes
-from splatsoil.benchmarks._truth import PATCH, Truth, cut_and_heaped, in_patches, stage_forces, volume_range
+from splatsoil.benchmarks._truth import (
+    PATCH,
+    Truth,
+    cut_and_heaped,
+    in_patches,
+    read_particles,
+    stage_forces,
+    volume_range,
+)
 
 from splatsoil.errors import MeasurementError, ParameterError
-from splatsoil.files import write_json
+from splatsoil.files import plain, read_json, write_json
 from splatsoil.mpm import PRESETS, Resolution, simulate
 from splatsoil.quiet import hush
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
 from splatsoil.soil.settings import FRICTION_ANGLE
+from splatsoil.synthetic.world import save_particles
 
 FRAMES = (50, 100, 150, 199)
 """At which drawn scenes are compared; sets at those of their true particles."""
@@ -50,21 +59,25 @@ def ploughed(cases: Mapping[str, Scene], out: Path, device: str, side_by_side: i
     Raises:
         ParameterError: the folder has another scene of a name, or one of other numerics.
     """
-    numerics = Numerics()
-    about = {name: {"scene": asdict(scene), "numerics": asdict(numerics)} for name, scene in cases.items()}
-    blank = {
-        name: Truth(scene.setup().experiment(), {}, numerics.spacing**3, {"friction_angle": scene.angle}, ())
-        for name, scene in cases.items()
-    }
-    missing = [name for name in cases if not (out / f"{name}.npz").is_file()]
+    numerics, truths = Numerics(), {}
+    about = {name: plain({"scene": asdict(scene), "numerics": asdict(numerics)}) for name, scene in cases.items()}
+    missing = [name for name in cases if not (out / f"{name}.json").is_file()]
     for group in (missing[k : k + side_by_side] for k in range(0, len(missing), side_by_side)):
         say(f"{', '.join(group)}: begun")
-        plain_sand = [Hidden(NOTHING, 0, cases[name]) for name in group]
-        soils = [each.soil(each.scene.setup(), numerics.spacing) for each in plain_sand]
-        for name, soil, run in zip(group, soils, plough(soils, numerics, FRAMES, device), strict=True):
-            made = replace(blank[name], particles={0: soil.particles, **run.particles}, force=run.force)
-            made.save(out / f"{name}.npz", about[name])
-    return {name: Truth.saved(out / f"{name}.npz", about[name], truth) for name, truth in blank.items()}
+        soils = [Hidden(NOTHING, 0, cases[name]).soil(cases[name].setup(), numerics.spacing) for name in group]
+        for name, run in zip(group, plough(soils, numerics, FRAMES, device), strict=True):
+            out.mkdir(parents=True, exist_ok=True)
+            save_particles(out / f"{name}.npz", run, run.frames)
+            write_json(out / f"{name}.json", {**about[name], "force": run.force})
+    for name, scene in cases.items():
+        kept = read_json(out / f"{name}.json")
+        force = np.array(kept.pop("force"))
+        if kept != about[name]:
+            raise ParameterError(f"{out / name}: is another scene or of other numerics; choose another --out")
+        particles, spacing = read_particles(out / f"{name}.npz")
+        values = {"friction_angle": scene.angle}
+        truths[name] = Truth(scene.setup().experiment(), particles, spacing**3, values, (), force)
+    return truths
 
 
 def of_set(folder: Path) -> Truth:
@@ -209,17 +222,17 @@ def convergence(scan: Scanner, truth: Truth, preset: str, cells: Sequence[float]
 def table(result: Mapping[str, Any]) -> str:
     """The result as Markdown."""
     cases, preset = result["cases"], result["preset"]
-    told = [f"Preset `{preset}`, {result['seeds']} particle seeds, {result['made_by']['device']}."]
-    told += _agreement({name: case["agreement"] for name, case in cases.items()})
+    text = [f"Preset `{preset}`, {result['seeds']} particle seeds, {result['made_by']['device']}."]
+    text += _agreement({name: case["agreement"] for name, case in cases.items()})
     for name, case in cases.items():
         if case.get("convergence"):
             head = [f"{name}: cell, mm", "angle off", "heights off, mm", "push force, N", "volume"]
-            told.append(markdown(head, [_convergence(row) for row in case["convergence"]]))
+            text.append(markdown(head, [_convergence(row) for row in case["convergence"]]))
         if case.get("changes"):
             head = [f"{name}: change", "shift of the angle", "of the push force"]
             shifts = [(r["change"], f"{r['angle']:+.1f}°", f"{100 * r['force']:+.0f} %") for r in case["changes"]]
-            told.append(markdown(head, shifts))
-    return "\n\n".join(told)
+            text.append(markdown(head, shifts))
+    return "\n\n".join(text)
 
 
 def _convergence(row: Mapping[str, float]) -> list[str]:

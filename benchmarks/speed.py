@@ -1,14 +1,13 @@
 """How fast is a simulation? Times, each beside another in the same run; for the whole path see `whole-path`.
 
 ``splatsoil benchmark speed --page docs/performance.md`` writes the CPU's section, with ``--device cuda:0`` the GPU's.
-Times of one thread are CPU times, which other programs disturb less than the clock's; all others are the clock's.
 Newton (extra ``independent``) is measured where it is installed.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -17,28 +16,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+import warp as wp
 from splatsoil.benchmarks._common import FloatArray, at_least, sources, stamp
 from splatsoil.benchmarks._newton import Numerics, Soil, plough
 from splatsoil.benchmarks._parts import Row, Section, parts_parser, run_parts
 from splatsoil.benchmarks._truth import Truth
 from splatsoil.benchmarks.effects import acting, strong
 
-from splatsoil.measurement import Measurement
-from splatsoil.mpm import PRESETS, Resolution, Solver, simulate
-from splatsoil.mpm.simulate import base_settings, step_poses
+from splatsoil.mpm import PRESETS, Resolution, simulate
 from splatsoil.quiet import hush
-from splatsoil.reconstruction import fill
+from splatsoil.soil.effect import Effect
 from splatsoil.soil.law import Law
 from splatsoil.soil.library import find_effects
-from splatsoil.synthetic import paper
 
 BATCH = 16
 """Parameter sets of one batch on a GPU."""
 WINDOWS, FRAMES = (0, 50, 150), 3
 """Frames at which pieces of Newton's run begin (soil at rest, pushed, tool drawn back), and how many of each count."""
-ROUNDS = 15
-"""Steps of each law, taken in turns."""
+FEW = 15
+"""Frames that laws are compared by."""
 
 
 def shown(times: FloatArray) -> str:
@@ -54,62 +50,16 @@ def ratio(times: FloatArray, other: FloatArray, name: str) -> str:
     return f"{shown(times)}; {name} {shown(other)}: {f'{faster:.0f}' if faster >= 100 else f'{faster:.3g}'} × as fast"
 
 
-def timed(task: Callable[[], object], repeats: int, device: str, *, warm: int = 1, wall: bool = False) -> FloatArray:
-    """Times (repeats,) in s after ``warm`` calls that do not count: of this thread on a CPU, unless ``wall``; else the
-    clock's."""
-    clock, times = time.thread_time if device == "cpu" and not wall else time.perf_counter, []
-    for _ in range(warm):
+def timed(task: Callable[[], object], repeats: int, device: str) -> FloatArray:
+    """The clock's times (repeats,) in s, after a call that compiles and does not count."""
+    times = []
+    for _ in range(1 + repeats):
+        began = time.perf_counter()
         task()
-    for _ in range(repeats):
-        _synchronise(device)
-        began = clock()
-        task()
-        _synchronise(device)
-        times.append(clock() - began)
-    return np.array(times)
-
-
-def _synchronise(device: str) -> None:
-    """Wait until a GPU has done what it was given, by Warp and by torch."""
-    if device != "cpu":
-        torch.cuda.synchronize(device)
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A bed that our solver ploughs.
-
-    Attributes:
-        measurement: bed, tool and motion.
-        resolution: of the solver.
-        x: particles (n, 3) in m.
-        values: parameters by name.
-        last: the run ends with this frame.
-    """
-
-    measurement: Measurement
-    resolution: Resolution
-    x: FloatArray
-    values: Mapping[str, float]
-    last: int
-
-    @property
-    def particle_steps(self) -> float:
-        """Particles times substeps of the grid in the whole run."""
-        r = self.resolution
-        return float(len(self.x)) * self.last * r.steps * r.substeps(r.steps)
-
-    def run(self, device: str, batch: int = 1) -> None:
-        """The whole run; the sets of a batch differ by their friction angles."""
-        angle = self.values["friction_angle"]
-        values = [{**self.values, "friction_angle": angle + 0.5 * k} for k in range(batch)]
-        simulate(self.measurement, self.x, values, resolution=self.resolution, frames=(self.last,), device=device)
-
-    def solver(self, law: Law, values: Mapping[str, float]) -> Solver:
-        """The solver at frame 0, on the CPU."""
-        bed, mesh, x = self.measurement.bed, self.measurement.tool.mesh, self.x[None].astype(np.float32)
-        settings = base_settings(self.measurement)
-        return Solver(x, bed.lower, bed.upper, mesh, self.resolution, law, settings, [{**self.values, **values}], "cpu")
+        if device != "cpu":
+            wp.synchronize_device(device)
+        times.append(time.perf_counter() - began)
+    return np.array(times[1:])
 
 
 @dataclass(frozen=True)
@@ -127,80 +77,76 @@ class Task:
         return Truth.load(self.folder)
 
     @cached_property
-    def scene(self) -> Scene:
-        """The set with its true angle."""
-        truth, resolution = self.truth, Resolution.derive(self.truth.measurement, self.preset)
-        x, angle = truth.start(resolution.spacing, 0), {"friction_angle": truth.values["friction_angle"]}
-        return Scene(truth.measurement, resolution, x, angle, max(truth.particles))
+    def resolution(self) -> Resolution:
+        """Of our solver."""
+        return Resolution.derive(self.truth.measurement, self.preset)
 
+    @cached_property
+    def x(self) -> FloatArray:
+        """(n, 3) particles in m."""
+        return self.truth.start(self.resolution.spacing, 0)
 
-def published_scene() -> Scene:
-    """The scene of the published table on cells of its size; its plate's thickness and frictions are the example's."""
-    setup, measurement = paper(), paper().experiment()
-    resolution = Resolution.derive(measurement, "paper")
-    x = fill(setup.surface, setup.bed, resolution.spacing, seed=0)
-    return Scene(measurement, resolution, x, {"friction_angle": 35.0}, max(setup.frames))
+    @property
+    def last(self) -> int:
+        """The run ends with this frame."""
+        return max(self.truth.particles)
+
+    def run(self, device: str, batch: int = 1, effects: Sequence[Effect] = (), last: int = 0) -> None:
+        """The whole run, or up to a frame, with effects on; the sets of a batch differ by their friction angles."""
+        angle, values = self.truth.values["friction_angle"], {k: v for e in effects for k, v in acting(e).items()}
+        each = [{**values, "friction_angle": angle + 0.5 * k} for k in range(batch)]
+        given, frames, law = self.truth.measurement, (last or self.last,), Law(effects)
+        simulate(given, self.x, each, law=law, resolution=self.resolution, frames=frames, device=device)
 
 
 def simulation(task: Task) -> Section:
     """Whole runs: one alone, and several at a time. A particle-step is a particle times a substep of the grid."""
-    scene, device, rows = task.scene, task.device, []
-    cases = {scene.measurement.name: scene}
-    if device != "cpu":
-        cases["the published scene"] = published_scene()
-    for name, one in cases.items():
-        alone = timed(partial(one.run, device), task.repeats, device)
-        what = f"{name}: {len(one.x)} particles, {one.last} frames"
-        rows.append(Row(what, f"{shown(alone)}; {1e-6 * one.particle_steps / np.median(alone):.3g} M particle-steps/s"))
-        if device != "cpu":
-            batch = timed(partial(one.run, device, BATCH), task.repeats, device)
-            each = ratio(batch, BATCH * alone, "one after the other")
-            rows.append(Row(f"{name}: {BATCH} parameter sets as one batch", each))
+    device, name, r = task.device, task.truth.measurement.name, task.resolution
+    alone = timed(partial(task.run, device), task.repeats, device)
+    steps = 1e-6 * len(task.x) * task.last * r.steps * r.substeps(r.steps) / np.median(alone)
+    what = f"{name}: {len(task.x)} particles, {task.last} frames"
+    rows = [Row(what, f"{shown(alone)}; {steps:.3g} M particle-steps/s")]
     if device == "cpu":
         with ThreadPoolExecutor(2) as pool:
-            pair = timed(lambda: list(pool.map(scene.run, ["cpu"] * 2)), task.repeats, "cpu", wall=True)
-        alone = timed(partial(scene.run, "cpu"), task.repeats, "cpu", warm=0, wall=True)
-        rows.append(Row("two runs side by side on two cores", ratio(pair, 2.0 * alone, "one after the other")))
-    return Section("Simulation", rows)
+            several = timed(lambda: list(pool.map(task.run, ["cpu"] * 2)), task.repeats, "cpu")
+        count, what = 2, "two runs side by side on two cores"
+    else:
+        several = timed(partial(task.run, device, BATCH), task.repeats, device)
+        count, what = BATCH, f"{BATCH} parameter sets as one batch"
+    return Section("Simulation", [*rows, Row(what, ratio(several, count * alone, "one after the other"))])
 
 
 def newton(task: Task) -> Section:
     """The whole run with ours, and in Newton's implicit MPM by pieces of it, from the true particles there."""
-    scene, truth = task.scene, task.truth
-    numerics = Numerics(voxel=scene.resolution.cell, substeps=2, iterations=120, tolerance=1e-4)
+    truth, spacing = task.truth, task.resolution.spacing
+    numerics = Numerics(voxel=task.resolution.cell, substeps=2, iterations=120, tolerance=1e-4)
     rng, seconds = np.random.default_rng(0), []
     for start in (w for w in WINDOWS if w in truth.particles):
         # as many particles as ours, which stand for as much soil
-        x = rng.permutation(truth.particles[start])[: len(scene.x)]
-        soil = Soil(truth.measurement, scene.values["friction_angle"], x, scene.resolution.spacing)
+        x = rng.permutation(truth.particles[start])[: len(task.x)]
+        soil = Soil(truth.measurement, truth.values["friction_angle"], x, spacing)
         ends: list[float] = []
         plough(
             [soil], numerics, (start + 1 + FRAMES,), task.device, begin=start,
             progress=lambda *_, ends=ends: ends.append(time.perf_counter()),
         )  # fmt: skip
         seconds.append(np.diff(ends))  # the first frame compiles, and lets stress build up
-    whole = scene.last * np.mean(seconds, axis=0)
-    ours = timed(partial(scene.run, task.device), task.repeats, task.device, wall=True)
+    whole = task.last * np.mean(seconds, axis=0)
+    ours = timed(partial(task.run, task.device), task.repeats, task.device)
     held = bool(np.median(whole) >= 20.0 * np.median(ours))
-    row = Row(f"{scene.measurement.name}, {scene.last} frames", ratio(ours, whole, "Newton"), "≥ 20 ×", held)
+    row = Row(f"{truth.measurement.name}, {task.last} frames", ratio(ours, whole, "Newton"), "≥ 20 ×", held)
     return Section("Against Newton's implicit MPM", [row])
 
 
 def effects(task: Task) -> Section:
-    """A step with all effects on strength that act together, over the base law's: least times, on the CPU."""
+    """Steps with all effects on strength that act together, over the base law's: least times, on the CPU."""
     names = strong()
-    acts = find_effects(names)
-    values = {key: value for effect in acts for key, value in acting(effect).items()}
-    scene, spent = task.scene, ([], [])  # type: ignore[var-annotated]
-    runs = scene.solver(Law(), {}), scene.solver(Law(acts), values)
-    r = scene.resolution
-    for frame in range(ROUNDS):
-        poses = step_poses(scene.measurement.tool.motion, frame * r.frame_time, r.frame_time, r.steps)
-        for run, own in zip(runs, spent, strict=True):
-            own.extend(timed(partial(run.advance, poses), 1, "cpu", warm=0))
-    base, whole = (min(own[1:]) for own in spent)
-    found, what = whole / base, f"a frame with {len(names)} effects on strength, over the base law's"
-    return Section("What effects cost", [Row(what, f"{found:.2f}", "≤ 2", found <= 2.0)])
+    base, whole = (
+        timed(partial(task.run, "cpu", effects=on, last=FEW), task.repeats, "cpu").min()
+        for on in ((), find_effects(names))
+    )
+    found, what = whole / base, f"{FEW} frames with {len(names)} effects on strength, over the base law's"
+    return Section("What effects cost", [Row(what, f"{found:.2f}", "≤ 2", bool(found <= 2.0))])
 
 
 PARTS = (simulation, newton, effects)

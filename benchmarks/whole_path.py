@@ -10,6 +10,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from argparse import Namespace
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -20,7 +21,7 @@ from splatsoil.benchmarks._common import sources
 from splatsoil.benchmarks._parts import Row, Section, parts_parser, run_parts
 from splatsoil.benchmarks._truth import Truth
 
-from splatsoil.comparison import Comparator, Comparison
+from splatsoil.comparison import Comparator
 from splatsoil.errors import RunError
 from splatsoil.files import read_json
 from splatsoil.measurement import Measurement
@@ -39,25 +40,6 @@ LEVEL = 0.45
 """Share of the bulk density at which the sets' pictures show the surface."""
 FINENESS, PADDING = 4, 3
 """Grid cells per particle spacing, and spacings of empty space around the bed, so that the blur ends in nothing."""
-
-
-@dataclass(frozen=True)
-class Task:
-    """What parts are made with.
-
-    Attributes:
-        dry: a measurement set with true particles that the base model can explain.
-        damp: one whose soil is cohesive.
-        preset: of reconstruction and solver.
-        device: where to compute.
-        out: folder for parts and runs.
-    """
-
-    dry: Path
-    damp: Path
-    preset: str
-    device: str
-    out: Path
 
 
 def true_surface(truth: Truth, cells: HeightField) -> HeightField:
@@ -84,19 +66,7 @@ def true_surface(truth: Truth, cells: HeightField) -> HeightField:
     return HeightField(cells.x, cells.y, np.where(filled.any(axis=2), height, np.nan))
 
 
-def floor(truth: Truth, reconstruction: Reconstruction, device: str) -> tuple[tuple[int, ...], Comparison]:
-    """Frames that the truth has, and the comparison of its true particles, drawn, with the photographs."""
-    measurement, frames = truth.measurement, (0, *truth.frames)
-    scene = build_scene(reconstruction, measurement, truth.particles[0], truth.spacing, device=device)
-    images = {}
-    for frame in frames:
-        posed = scene.pose(truth.particles[frame], None, measurement.tool.motion.pose(frame / measurement.frame_rate))
-        for name, camera in measurement.cameras.items():
-            images[name, frame] = scene.picture(posed, camera.undistorted())
-    return frames, Comparator(measurement, surface=reconstruction.surface, frames=frames).compare(images)
-
-
-def reconstruction(task: Task) -> Section:
+def reconstruction(task: Namespace) -> Section:
     """Time, likeness to photographs that were set aside, and the surface against the true one."""
     truth, made = Truth.load(task.dry), _reconstructed(task.dry, task.preset, task.device)
     exact = true_surface(truth, made.surface)
@@ -114,12 +84,18 @@ def reconstruction(task: Task) -> Section:
     return Section("Reconstruction", rows)
 
 
-def renderer(task: Task) -> Section:
+def renderer(task: Namespace) -> Section:
     """The error of true particles drawn through the whole scene path, beside that of wrong simulations."""
     truth, made = Truth.load(task.dry), _reconstructed(task.dry, task.preset, task.device)
-    frames, least = floor(truth, made, task.device)
-    model = Model(truth.measurement, made, preset=task.preset, device=task.device)
-    comparator = Comparator(truth.measurement, surface=made.surface, frames=frames)
+    measurement, frames = truth.measurement, (0, *truth.frames)
+    scene = build_scene(made, measurement, truth.particles[0], truth.spacing, device=task.device)
+    motion, images = measurement.tool.motion, {}
+    for frame in frames:
+        posed = scene.pose(truth.particles[frame], None, motion.pose(frame / measurement.frame_rate))
+        for name, camera in measurement.cameras.items():
+            images[name, frame] = scene.picture(posed, camera.undistorted())
+    comparator = Comparator(measurement, surface=made.surface, frames=frames)
+    model, least = Model(measurement, made, preset=task.preset, device=task.device), comparator.compare(images)
     weak, strong = (
         comparator.compare(model.predict({"friction_angle": truth.values["friction_angle"] + by}, 0).images)
         for by in (-AWAY, AWAY)
@@ -136,7 +112,7 @@ def renderer(task: Task) -> Section:
     return Section("Renderer", rows)
 
 
-def dry(task: Task) -> Section:
+def dry(task: Namespace) -> Section:
     """The command that a user gives, for three seeds."""
     true = Truth.load(task.dry).values["friction_angle"]
     # only a run that has not begun can be timed
@@ -159,7 +135,7 @@ def dry(task: Task) -> Section:
     return Section("Friction angle from photographs and force", rows)
 
 
-def damp(task: Task) -> Section:
+def damp(task: Namespace) -> Section:
     """The command adds what the damp set has and the base model lacks, and nothing else."""
     true, run = Truth.load(task.damp).values, _run(task, task.damp, 0)[0]
     added, estimates = read_json(run / "fit.json")["setup"]["effects"], read_json(run / "diagnosis.json")["estimates"]
@@ -194,7 +170,7 @@ sys.exit(code)
 """
 
 
-def _run(task: Task, folder: Path, seed: int, *options: str) -> tuple[Path, Ran]:
+def _run(task: Namespace, folder: Path, seed: int, *options: str) -> tuple[Path, Ran]:
     """The folder of ``splatsoil run`` in a process of its own, and what it took; a run that began before goes on.
 
     Raises:
@@ -222,8 +198,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--preset", default="small", choices=sorted(PRESETS))
     options = parser.parse_args(arguments)
     hush()
-    task = Task(options.dry, options.damp, options.preset, options.device, options.out)
-    sets = {name: Measurement.load(folder).hash for name, folder in (("dry", task.dry), ("damp", task.damp))}
-    key = {"code": sources("whole_path"), "preset": task.preset, **sets}
-    parts = {part.__name__.replace("_", "-"): partial(part, task) for part in PARTS}
+    sets = {name: Measurement.load(folder).hash for name, folder in (("dry", options.dry), ("damp", options.damp))}
+    key = {"code": sources("whole_path"), "preset": options.preset, **sets}
+    parts = {part.__name__: partial(part, options) for part in PARTS}
     return run_parts(options, parts, lambda _: key, "whole path")

@@ -14,7 +14,7 @@ from .synthetic import BLOCKS, FloatArray, HiddenTruth
 
 
 class EmulatedProblem(HiddenTruth):
-    """What SyntheticProblem would answer, on average, with chance of the same covariance; without sensor noise.
+    """What SyntheticProblem would answer, on average, with scatter of the same covariance; without sensor noise.
 
     Args:
         parameters, effects: one of the combinations that have been simulated.
@@ -36,7 +36,7 @@ class EmulatedProblem(HiddenTruth):
         """One draw of what a simulation would come to."""
         (observed, beside), (predicted, as_well) = self.observed(), self._recorded(parameters, seed)
         residual = observed - predicted
-        # What is beside the components is chance: there is none in soil that doesn't move.
+        # What is beside the components is scatter: there is none in soil that doesn't move.
         loss = float((residual @ residual + beside + as_well) / (observed @ observed + beside))
         return Evaluation(
             loss=min(loss, self.worst_loss), blocks=self.surface.patches @ residual, predicted=self._picture(predicted)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
@@ -57,9 +57,18 @@ def soil_of(effect: str) -> SyntheticProblem:
     return SyntheticProblem(["friction_angle", *([strength] if strength else [])], [effect] if strength else [])
 
 
+Seen = Callable[[SyntheticExperiment, Image], FloatArray]
+"""What an experiment's pictures (k, h, w, 3) show."""
+
+
+def change(experiment: SyntheticExperiment, pictures: Image) -> FloatArray:
+    """(k, h, w, 3) how much brighter soil that moves makes blurred pictures."""
+    return blurred(pictures) - blurred(experiment.still())
+
+
 def evidence(experiment: SyntheticExperiment, pictures: Image) -> FloatArray:
-    """(72,) how much brighter a stroke makes each patch of its pictures (k, h, w, 3), in grey levels."""
-    return patches(blurred(pictures) - blurred(experiment.still()))
+    """(72,) how much brighter a stroke makes each patch of its pictures, in grey levels."""
+    return patches(change(experiment, pictures))
 
 
 @dataclass(frozen=True)
@@ -69,11 +78,11 @@ class Surface:
     Attributes:
         degree: with the smallest leave-one-out error.
         coefficients: (m, k) of products of the inputs' powers.
-        factor: (k, k) Cholesky factor of the residuals' covariance, in units of :meth:`scale`: what chance adds to one
+        factor: (k, k) Cholesky factor of the residuals' covariance, in units of :meth:`scale`: what scatter adds to one
             simulation.
         growth: (n,) slopes of ln :meth:`scale`.
         patches: (72, k) what a unit of each component adds to the patches, in grey levels.
-        left: mean square sum of what chance adds beside the components, in the same units.
+        left: mean square sum of what scatter adds beside the components, in the same units.
     """
 
     degree: int
@@ -99,7 +108,7 @@ class Surface:
         terms = _terms(points, degree)
         freedom = len(points) - terms.shape[1]
         residual = features - terms @ np.linalg.lstsq(terms, features, rcond=None)[0]
-        # Chance grows along inputs: multiplicative heteroscedasticity (Harvey 1976).
+        # Scatter grows along inputs: multiplicative heteroscedasticity (Harvey 1976).
         straight = np.column_stack([np.ones(len(points)), points])
         growth = np.linalg.lstsq(straight, 0.5 * np.log(np.sum(residual**2, axis=1)), rcond=None)[0][1:]
         residual /= np.exp(points @ growth)[:, None]
@@ -118,14 +127,14 @@ class Surface:
         return _terms(points, self.degree) @ self.coefficients
 
     def scale(self, points: FloatArray) -> FloatArray:
-        """(q,) how large chance is at points (q, n)."""
+        """(q,) how large scatter is at points (q, n)."""
         return np.asarray(np.exp(points @ self.growth))
 
     def draw(self, point: FloatArray, seed: int) -> tuple[FloatArray, float]:
         """One simulation at a point (n,): components (k,), and the square sum of what is beside them."""
         scale = float(np.exp(point @ self.growth))
-        chance = self.factor @ np.random.default_rng(seed).standard_normal(len(self.factor))
-        return self.mean(point[None])[0] + scale * chance, scale**2 * self.left
+        scatter = self.factor @ np.random.default_rng(seed).standard_normal(len(self.factor))
+        return self.mean(point[None])[0] + scale * scatter, scale**2 * self.left
 
 
 @cache
@@ -180,28 +189,17 @@ def stroke_surfaces(points: Mapping[str, FloatArray], evidences: Mapping[str, Fl
     return {f"stroke/{name}": Surface.fit(points[name], evidences[name], basis, basis) for name in evidences}
 
 
-def simulate_guessed(name: str) -> tuple[FloatArray, FloatArray]:
-    """Points (N, n) and blurred changes of pictures (N, k, h, w, 3); a simulation that fails is left out."""
-    parameters, effects, count = GUESSED[name]
-    problem = SyntheticProblem(parameters, effects)
-    still, kept = blurred(problem.experiment.still()), []
-    for seed, point in enumerate(sobol(count, len(parameters))):
-        (made,) = problem.experiment.simulated([(problem.space.to_dict(problem.space.from_unit(point)), seed)])
-        if not isinstance(made, SimulationError):
-            kept.append((point, blurred(made) - still))
-    return np.array([p for p, _ in kept]), np.array([change for _, change in kept])
-
-
-def simulate_strokes(effect: str) -> tuple[FloatArray, FloatArray]:
-    """Points (N, n + 2), the last two the stroke's, and evidences (N, 72); a simulation that fails is left out."""
-    problem, kept = soil_of(effect), []
-    n = len(problem.space)
-    for seed, point in enumerate(sobol(STROKE_SIMULATIONS, n + 2)):
-        experiment = SyntheticExperiment(problem.effects, "tiny", "cpu", stroke_at(point[n:]))
+def simulated(problem: SyntheticProblem, count: int, seen: Seen, *, strokes: bool) -> tuple[FloatArray, FloatArray]:
+    """Points (N, n) of the parameters, with ``strokes`` (N, n + 2), and what is seen of each; a simulation that fails
+    is left out."""
+    n, kept = len(problem.space), []
+    for seed, point in enumerate(sobol(count, n + len(STROKES) * strokes)):
+        stroke = stroke_at(point[n:]) if strokes else None
+        experiment = SyntheticExperiment(problem.effects, "tiny", "cpu", stroke) if strokes else problem.experiment
         (made,) = experiment.simulated([(problem.space.to_dict(problem.space.from_unit(point[:n])), seed)])
         if not isinstance(made, SimulationError):
-            kept.append((point, evidence(experiment, made)))
-    return np.array([p for p, _ in kept]), np.array([seen for _, seen in kept])
+            kept.append((point, seen(experiment, made)))
+    return np.array([point for point, _ in kept]), np.array([features for _, features in kept])
 
 
 def stroke_at(point: FloatArray) -> Stroke:
@@ -225,8 +223,11 @@ def main(arguments: Sequence[str]) -> int:
     if len(arguments) != 1 or arguments[0].startswith("-"):
         print(__doc__, file=sys.stderr)
         return 2
-    made = {name: guessed_surface(*simulate_guessed(name)) for name in GUESSED}
-    strokes = {effect: simulate_strokes(effect) for effect in STRENGTHS}
+    made = {
+        name: guessed_surface(*simulated(SyntheticProblem(free, on), count, change, strokes=False))
+        for name, (free, on, count) in GUESSED.items()
+    }
+    strokes = {e: simulated(soil_of(e), STROKE_SIMULATIONS, evidence, strokes=True) for e in STRENGTHS}
     made |= stroke_surfaces(*({effect: pair[k] for effect, pair in strokes.items()} for k in (0, 1)))
     save(Path(arguments[0]), made)
     return 0

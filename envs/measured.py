@@ -142,9 +142,15 @@ def cache_folder() -> Path:
 def cached_reconstruction(measurement: Measurement, preset: str, device: str) -> Reconstruction:
     """The set's reconstruction with seed 0, made once for a set, a preset and the code that makes it."""
     from splatsoil.files import RECONSTRUCTING, code_digest
+
+    place = cache_folder() / f"{measurement.hash[:16]}-{preset}-{code_digest(RECONSTRUCTING)}"
+    return reconstructed(measurement, place, preset, device)
+
+
+def reconstructed(measurement: Measurement, folder: Path, preset: str, device: str) -> Reconstruction:
+    """The set's reconstruction with seed 0, from the folder or made and kept there."""
     from splatsoil.reconstruction import Reconstruction, reconstruct
 
-    folder = cache_folder() / f"{measurement.hash[:16]}-{preset}-{code_digest(RECONSTRUCTING)}"
     if not (folder / "reconstruction.json").is_file():
         reconstruct(measurement, preset=preset, device=device).save(folder)
     return Reconstruction.load(folder)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from splatsoil.errors import ParameterError
 
 from .episode import Array, EpisodeEnv
-from .problem import Evaluation, Image, Job, Problem, simulation_seed
+from .problem import Evaluation, Job, Problem, simulation_seed
 from .together import attempt
 
 Observation = dict[str, npt.NDArray[np.float32]]
@@ -58,7 +58,7 @@ class PlowSandEnv(EpisodeEnv[Observation]):
         reconstruction: folder of a saved reconstruction of the measurement; made (minutes) when there is none.
         render_mode: ``rgb_array`` shows observed | predicted | difference.
         same_particles: simulate all of an episode with the same particles, so that two losses differ by their
-            parameters and hardly by chance (common random numbers); by default each has its own.
+            parameters and hardly by scatter (common random numbers); by default each has its own.
         fast: the synthetic experiment emulated, for the parameters and effects that there is an emulator of.
         problem: a simulate-and-compare of one's own instead of all of the above but the budget.
     """
@@ -160,15 +160,15 @@ class PlowSandEnv(EpisodeEnv[Observation]):
         truth = self.problem.truth()
         if truth is None:
             return {}
-        told: dict[str, Any] = {"truth": dict(truth)}
+        found: dict[str, Any] = {"truth": dict(truth)}
         if self._best_loss is not None:
             best = self.values(self._best_action)
-            told["error"] = {name: best[name] - value for name, value in truth.items() if name in best}
+            found["error"] = {name: best[name] - value for name, value in truth.items() if name in best}
             if self._of_truth is None:
                 self._of_truth = attempt(self.problem, truth, self._last_seed)
             if self._of_truth.loss is not None:
-                told["regret"] = self._best_loss - self._of_truth.loss
-        return told
+                found["regret"] = self._best_loss - self._of_truth.loss
+        return found
 
     def _observation(self) -> Observation:
         worst = self.problem.worst_loss
@@ -195,14 +195,10 @@ class PlowSandEnv(EpisodeEnv[Observation]):
             observed = self.problem.observed_image()
         predicted = None if evaluation is None else evaluation.predicted
         black = np.zeros_like(observed)
-        difference = black if predicted is None else signed_difference(observed, predicted)
+        # grey where both agree, brighter where the observation is, darker where the prediction is
+        difference = black if predicted is None else 0.5 + (observed - predicted)
         strip = np.concatenate([observed, black if predicted is None else predicted, difference], axis=1)
         return np.rint(np.clip(strip, 0.0, 1.0) * 255.0).astype(np.uint8)
-
-
-def signed_difference(observed: Image, predicted: Image) -> Image:
-    """(h, w, 3): grey where both agree, brighter where the observation is, darker where the prediction is."""
-    return np.clip(0.5 + (observed - predicted), 0.0, 1.0).astype(np.float32)
 
 
 def _problem(

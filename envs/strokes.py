@@ -1,4 +1,4 @@
-"""Environments whose steps are strokes in soil that nobody guesses point by point: name its effect, choose a stroke."""
+"""Environments whose steps are strokes: name the effect that is in the soil, or choose the stroke that tells most."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ class DesignEnv(EpisodeEnv[dict[str, Array]]):
         return float(np.mean([_information(self._updated(means, scales, one)) for one in seen]))
 
     def _predicted(self, stroke: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Means (512, k) of what each particle shows, where chance has covariance 1, and factors (512,) of chance."""
+        """Means (512, k) of what each particle shows, where scatter has covariance 1, and factors (512,) of scatter."""
         points = np.column_stack([self._particles, np.tile(stroke, (PARTICLES, 1))])
         return self._surface.mean(points) @ self._whitening, self._surface.scale(points)
 

@@ -1,7 +1,7 @@
 """Simulate-and-compare against a hidden truth of the experiment in `synthetic_experiment`.
 
 The same solver and the same renderer make the observation and the predictions, with other particles, so that the best
-loss is chance and not zero. It is a toy for trying agents on; an answer about real soil needs a measurement set.
+loss is seed-to-seed scatter and not zero. Agents can be tried on it; an answer about real soil needs a measurement set.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ FloatArray = npt.NDArray[np.float64]
 SENSOR_NOISE = 0.006
 #: Hidden values are drawn from this middle part of a parameter's range.
 HIDDEN_RANGE = (0.2, 0.8)
-#: Pictures are compared after a blur of this standard deviation in pixels: which grain lies where is chance.
+#: Pictures are compared after a blur of this standard deviation in pixels: single grains differ from seed to seed.
 BLUR = 1.5
 #: Patches of residuals along each picture's height and width.
 BLOCKS = (3, 4)
@@ -58,7 +58,7 @@ def compare(observed: Image, predicted: Image, still: Image) -> tuple[float, Flo
 
     Args:
         observed: what the cameras saw.
-        predicted: what the model says.
+        predicted: what the model predicts.
         still: what they would have seen had the soil not moved.
 
     Returns:

@@ -25,20 +25,7 @@ if TYPE_CHECKING:
 
 def attempt(problem: Problem, parameters: Mapping[str, float], seed: int) -> Evaluation:
     """An evaluation, a failed simulation being one too, with the time it took."""
-    began = time.perf_counter()
-    evaluation = _outcome(problem, lambda: problem.evaluate(parameters, seed))
-    return replace(evaluation, seconds=time.perf_counter() - began)
-
-
-def _outcome(problem: Problem, evaluate: Callable[[], Evaluation]) -> Evaluation:
-    """What an evaluation comes to if its simulation can go on, and if not."""
-    try:
-        evaluation = evaluate()
-        if evaluation.loss is not None and not math.isfinite(evaluation.loss):
-            raise SimulationError(f"the loss is {evaluation.loss}")
-    except SimulationError as error:
-        return Evaluation(None, np.zeros(problem.block_count), message=str(error))
-    return evaluation
+    return _evaluations([problem], [partial(problem.evaluate, parameters, seed)], time.perf_counter())[0]
 
 
 def evaluate_together(problems: Sequence[Problem], jobs: Sequence[Job]) -> list[Evaluation]:
@@ -75,8 +62,8 @@ def _measured(problem: MeasuredProblem, jobs: Sequence[Job]) -> list[Evaluation]
 
     def simulated(some: Sequence[Job]) -> Sequence[Trajectory | SimulationError]:
         particles = [model.particles(seed) for _, seed in some]
-        told = problem.experiment.progress
-        return simulate_together(model.measurement, particles, [v for v, _ in some], model, told)
+        values, progress = [values for values, _ in some], problem.experiment.progress
+        return simulate_together(model.measurement, particles, values, model, progress)
 
     found = in_batches(simulated, jobs, "simulations")
     made = (
@@ -95,5 +82,20 @@ def _judged(problems: Sequence[Any], made: Iterable[Any], began: float) -> list[
         evaluation: Evaluation = problem.judge(one)
         return evaluation
 
-    out = [_outcome(p, partial(judged, p, one)) for p, one in zip(problems, made, strict=True)]
+    return _evaluations(problems, (partial(judged, *pair) for pair in zip(problems, made, strict=True)), began)
+
+
+def _evaluations(
+    problems: Sequence[Problem], ways: Iterable[Callable[[], Evaluation]], began: float
+) -> list[Evaluation]:
+    """Evaluations, failed ones where a simulation could not go on; each with an equal share of the time since then."""
+    out = []
+    for problem, evaluate in zip(problems, ways, strict=True):
+        try:
+            evaluation = evaluate()
+            if evaluation.loss is not None and not math.isfinite(evaluation.loss):
+                raise SimulationError(f"the loss is {evaluation.loss}")
+        except SimulationError as error:
+            evaluation = Evaluation(None, np.zeros(problem.block_count), message=str(error))
+        out.append(evaluation)
     return [replace(evaluation, seconds=(time.perf_counter() - began) / len(out)) for evaluation in out]

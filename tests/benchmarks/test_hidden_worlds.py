@@ -103,14 +103,12 @@ def test_an_experiment_that_newton_fails_on_costs_no_other(tmp_path: Path, monke
     """Those of its group are simulated alone."""
     asked, done = [], []
 
-    def plough(group: Any, *_: Any) -> list[None]:
+    def by_newton(_: Any, group: Any) -> None:
         asked.append([hidden.name for hidden in group])
         if "tilt-0" in asked[-1]:
             raise ValueError("array shapes")
-        return [None] * len(group)
 
-    monkeypatch.setattr(hidden_worlds, "ploughed_by_newton", plough)
-    monkeypatch.setattr(hidden_worlds, "photograph_run", lambda *_, **__: None)
+    monkeypatch.setattr(hidden_worlds.Study, "by_newton", by_newton)
     monkeypatch.setattr(hidden_worlds.Study, "judge", lambda _, hidden: done.append(hidden.name))
     kinds = ("gravity", "tilt", "cohesion", "viscosity")
     assert main(["--kinds", *kinds, "--simulated-side-by-side", "3", "--out", str(tmp_path / "out")]) == 1

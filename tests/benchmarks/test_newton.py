@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from splatsoil.benchmarks._hidden import NOTHING, Hidden
-from splatsoil.benchmarks._newton import Numerics, Run, Soil, _model, plough
+from splatsoil.benchmarks._newton import Numerics, Soil, _model, plough
 from splatsoil.benchmarks._scenes import Scene
 from splatsoil.benchmarks._truth import Truth
+
+from splatsoil.mpm import Trajectory
 
 SPACING, COARSE = 0.02, Numerics(voxel=0.04, substeps=2, iterations=60)
 
@@ -68,11 +70,11 @@ def test_soil_falls_as_its_own_gravity_pulls() -> None:
     substeps = 5 * COARSE.substeps
     for pull, run in zip(pulls, runs, strict=True):
         fall = pull * 0.01**2 * substeps * (substeps + 1) / 2  # each step by the velocity at its end
-        assert (lump - run.particles[5])[:, 2].mean() == pytest.approx(fall, rel=0.02, abs=1e-6)
+        assert (lump - run.at(5)[0])[:, 2].mean() == pytest.approx(fall, rel=0.02, abs=1e-6)
 
 
 @pytest.fixture(scope="module")
-def ploughed() -> tuple[Truth, list[Run]]:
+def ploughed() -> tuple[Truth, list[Trajectory]]:
     """Two coarse soils, ten frames into the push."""
     pytest.importorskip("newton")
     truth = Truth.load(Path(__file__).parents[2] / "examples" / "plow-damp")
@@ -89,15 +91,15 @@ def test_soil_depends_on_no_other_beside_it() -> None:
     level = soil_of(Scene(seed=1, angle=35.0, bed="flat", tool="drum", rolling=1.2, depth=0.05), SPACING)
     slope = soil_of(Scene(seed=2, angle=26.0, bed="sloping", slope=6.0, density=1450.0, width=0.16, tilt=0.0), SPACING)
     beside, alone = plough([level, slope], COARSE, (30,)), plough([slope], COARSE, (30,))[0]
-    moved = np.linalg.norm(alone.particles[30] - slope.particles, axis=1)
-    apart = np.linalg.norm(beside[1].particles[30] - alone.particles[30], axis=1)
+    moved = np.linalg.norm(alone.at(30)[0] - slope.particles, axis=1)
+    apart = np.linalg.norm(beside[1].at(30)[0] - alone.at(30)[0], axis=1)
     assert np.percentile(moved, 99) > 10e-3
     assert np.percentile(apart, 99) < 0.2e-3
     assert beside[1].force[20:].mean(axis=0) == pytest.approx(alone.force[20:].mean(axis=0), rel=0.02, abs=0.5)
 
 
 @pytest.mark.slow
-def test_the_force_is_the_soils_on_the_tool(ploughed: tuple[Truth, list[Run]]) -> None:
+def test_the_force_is_the_soils_on_the_tool(ploughed: tuple[Truth, list[Trajectory]]) -> None:
     """Next to nothing before it arrives; then against its way and up, more of it in stronger soil, and of the set's
     size: coarse voxels and few iterations bear less."""
     truth, (strong, weak) = ploughed

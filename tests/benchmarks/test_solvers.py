@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from splatsoil.benchmarks import solvers
+from splatsoil.benchmarks._common import Clock
 from splatsoil.benchmarks._scenes import ANGLES, BEDS, RADIUS, TOOLS, Scene, scenes
 from splatsoil.benchmarks._truth import Truth, in_patches
 from splatsoil.benchmarks.solvers import Scan, agreement, compare_stages, main
 
 from splatsoil.errors import ParameterError
-from splatsoil.mpm import Resolution, simulate
+from splatsoil.mpm import Resolution, Trajectory, simulate
 from splatsoil.reconstruction import fill
 
 SLOPING = Scene(seed=7, angle=34.0, bed="sloping", slope=6.0, towards=30.0)
@@ -113,6 +114,24 @@ def test_our_own_run_is_found_to_be_one(ours: Truth) -> None:
     low = agreement(Scan.simulated(wrong, [0], "cpu", tiny, (6.0, 12.0)))
     assert low["best_angle"] > 33.0
     assert low["stages"]["pushing"]["off"] > 0.1
+
+
+def test_what_newton_made_is_kept_and_another_scene_is_not_taken_for_it(
+    ours: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    positions = np.array(list(ours.particles.values()), dtype=np.float32)
+    run = Trajectory(tuple(ours.particles), positions, np.zeros(0), ours.force, ours.spacing, None)  # type: ignore[arg-type]
+    simulated: list[int] = []
+    monkeypatch.setattr(solvers, "plough", lambda soils, *_: simulated.append(len(soils)) or [run] * len(soils))
+    scene = Scene(seed=7, angle=36.0)
+    for _ in range(2):
+        (truth,) = solvers.ploughed({"one": scene}, tmp_path, "cpu", 4, Clock()).values()
+    assert simulated == [1] and truth.frames == ours.frames and truth.values == ours.values
+    assert truth.spacing == pytest.approx(ours.spacing) and np.array_equal(truth.force, ours.force)
+    for frame, x in ours.particles.items():
+        assert np.abs(truth.particles[frame] - x).max() < 2e-5
+    with pytest.raises(ParameterError, match="another --out"):
+        solvers.ploughed({"one": replace(scene, angle=30.0)}, tmp_path, "cpu", 4, Clock())
 
 
 def test_a_change_of_nothing_shifts_nothing_and_each_change_is_of_one_thing(

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from splatsoil.benchmarks._scenes import Scene
-from splatsoil.benchmarks._truth import SCALE, Truth, cut_and_heaped, in_patches, stage_forces, volume_range
+from splatsoil.benchmarks._truth import Truth, cut_and_heaped, in_patches, stage_forces, volume_range
 
-from splatsoil.errors import MeasurementError, ParameterError
+from splatsoil.errors import MeasurementError
 from splatsoil.measurement import ToolMotion
 
 STAGES = {"lowering": (2.0, 60.0), "pushing": (-150.0, 70.0), "pause": (-40.0, 25.0), "withdrawal": (30.0, 5.0)}
@@ -49,19 +49,6 @@ def test_a_set_of_ours_is_read_like_the_examples(plow_dry: Path, tmp_path: Path)
     (shifted / "truth.json").write_text("{}")
     with pytest.raises(MeasurementError, match="true parameters"):
         Truth.load(shifted)
-
-
-def test_what_is_saved_is_read_again_and_nothing_else_is_taken_for_it(plow_dry: Path, tmp_path: Path) -> None:
-    truth = Truth.load(plow_dry)
-    file, about = tmp_path / "scene.npz", {"scene": {"seed": 1, "angle": 36.0}}
-    truth.save(file, about)
-    again = Truth.saved(file, about, replace(truth, particles={}, volume=0.0, force=None))
-    assert again.frames == truth.frames and again.spacing == pytest.approx(truth.spacing)
-    assert truth.force is not None and again.force == pytest.approx(truth.force, rel=1e-6)
-    for frame, x in truth.particles.items():
-        assert np.abs(again.particles[frame] - x).max() <= 0.5 * SCALE + 1e-9
-    with pytest.raises(ParameterError, match="another --out"):
-        Truth.saved(file, {"scene": {"seed": 2, "angle": 36.0}}, truth)
 
 
 def test_other_particles_fill_the_same_bed(plow_dry: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,14 +10,14 @@ import numpy as np
 import pytest
 from splatsoil.benchmarks import whole_path
 from splatsoil.benchmarks._truth import Truth
-from splatsoil.benchmarks.whole_path import Task, true_surface
+from splatsoil.benchmarks.whole_path import true_surface
 
 from splatsoil.reconstruction import HeightField
 
 
 @pytest.fixture
-def task(plow_dry: Path, plow_damp: Path, tmp_path: Path) -> Task:
-    return Task(plow_dry, plow_damp, "tiny", "cpu", tmp_path)
+def task(plow_dry: Path, plow_damp: Path, tmp_path: Path) -> Namespace:
+    return Namespace(dry=plow_dry, damp=plow_damp, preset="tiny", device="cpu", out=tmp_path)
 
 
 def test_the_surface_of_a_level_bed_is_level(plow_dry: Path) -> None:
@@ -31,7 +32,7 @@ def test_the_surface_of_a_level_bed_is_level(plow_dry: Path) -> None:
 
 
 @pytest.mark.slow
-def test_reconstruction_and_renderer_on_few_particles(task: Task) -> None:
+def test_reconstruction_and_renderer_on_few_particles(task: Namespace) -> None:
     rows = whole_path.reconstruction(task).rows
     assert len(rows) == 2 and rows[1].held is not None
     loss, raw = whole_path.renderer(task).rows
