@@ -41,6 +41,7 @@ class Posed:
         features: (n, 4): albedo (soil) or colour (surroundings) in sRGB, and 1 for soil.
         grains: the particles' own Gaussians among them.
         grain_numbers: (g,) int32: the particles whose own these are.
+        nearest: (n, 3) of each, the point of the tool that is nearest to it, m.
         discs: centres (k, 3) and covariances (k, 3, 3) of the discs that stand for the tool.
         lit: the soil's surface under the light, with the tool's pose.
     """
@@ -51,6 +52,7 @@ class Posed:
     features: Tensor
     grains: slice
     grain_numbers: Tensor
+    nearest: Tensor
     discs: tuple[Tensor, Tensor]
     lit: LitRelief
 
@@ -94,12 +96,15 @@ def layers_of(
         tool_albedo: (3,) linear.
     """
     device = views[0][0].centres.device
-    behind = upload([*np.asarray(background, dtype=np.float64), 0.0, 0.0], device)
+    behind = upload([*np.asarray(background, dtype=np.float64), 0.0, 0.0, 0.0], device)
     seen = []
     for posed, camera in views:
         view = upload(camera.world_to_camera, device)
         along = posed.centres @ view[2, :3] + view[2, 3]
-        features = torch.cat([posed.features, along[:, None]], dim=1)
+        # Before the tool is what lies nearer to the camera than the tool's nearest point.
+        towards = posed.centres - upload(camera.position, device)
+        before = ((posed.centres - posed.nearest) * towards).sum(dim=1) < 0.0
+        features = torch.cat([posed.features, along[:, None], before[:, None]], dim=1)
         seen.append(Seen(posed.centres, posed.covariances, posed.opacities, features, camera))
     image, alpha = yield from rasterise_views.steps(seen, background=behind, antialias=True)
     covered = alpha.clamp_min(1e-3)
@@ -108,11 +113,11 @@ def layers_of(
     ground = (alpha > 0.3) & (image[..., 3] > 0.5 * alpha)
     filled = image[..., :4] - (1.0 - alpha[..., None]) * behind[:4]
     shown = torch.where(ground[..., None], filled / covered[..., None], image[..., :4])
-    colour, soil = shown[..., :3], shown[..., 3].contiguous()
+    colour, soil, front = shown[..., :3], shown[..., 3].contiguous(), image[..., 5].contiguous()
     light, tool = (torch.empty((*depth.shape, k), dtype=torch.float32, device=device) for k in (3, 4))
     for k, (posed, camera) in enumerate(views):
         pixels = kernels.Pixels()
-        pixels.depth, pixels.soil = wp.from_torch(depth[k]), wp.from_torch(soil[k])
+        pixels.depth, pixels.soil, pixels.before = (wp.from_torch(m[k]) for m in (depth, soil, front))
         pixels.light, pixels.tool = wp.from_torch(light[k], dtype=wp.vec3), wp.from_torch(tool[k], dtype=wp.vec4)
         _illuminate(posed.lit, camera, pixels, tool_albedo)
     return Layers(colour, soil, depth, light, tool)

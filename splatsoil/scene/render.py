@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splatsoil.batches import in_batches
 from splatsoil.measurement import Bed, Camera
-from splatsoil.scene import kernels_visible
+from splatsoil.scene import kernels, kernels_visible
 from splatsoil.scene.albedo import BRIGHTEST, SurfaceAlbedo, other_grain_albedo
 from splatsoil.scene.binding import Binding, bind
 from splatsoil.scene.layers import Layers, Posed, layers_of
@@ -217,8 +217,10 @@ class Scene:
             part.copy_(still)
         discs = (x.new_zeros((0, 3)), x.new_zeros((0, 3, 3))) if tool is None else self.tool.discs(*tool)
         centres, covariances, opacities, features = drawn
+        nearest = torch.empty_like(centres)
+        launch(kernels.nearest_of_tool, len(centres), [placed, *(as_warp(t, wp.vec3) for t in (centres, nearest))], x)
         own = slice(counts[0], counts[0] + counts[1])
-        return Posed(centres, covariances, opacities, features, own, chosen[1], discs, lit)
+        return Posed(centres, covariances, opacities, features, own, chosen[1], nearest, discs, lit)
 
     def recoloured(self, posed: Posed) -> Posed:
         """What was posed of the same soil with other colours beneath its surface, in this scene's."""
