@@ -1,6 +1,6 @@
 # mypy: ignore-errors
 # (Warp reads the annotations of kernels as types of its own)
-"""Warp kernels of light and shade; the same source runs on CPU and CUDA.
+"""Warp kernels of shading, shadows and the tool; the same source runs on CPU and CUDA.
 
 Every kernel is a gather: each thread writes its own outputs, so results do not depend on the order of threads.
 """
@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import warp as wp
 
+from splatsoil.scene.kernels_horizon import scan_horizon
 from splatsoil.scene.kernels_maps import Maps, Surface, ToolPose, cell_centre, height_at, outward, sample
-from splatsoil.scene.kernels_sky import look_around
 
 STEEP, STEEPEST = wp.constant(0.7), wp.constant(0.5)
 """Upward parts of normals (45°, 60°) between which a surface's slope is less and less that of its heights."""
@@ -148,7 +148,7 @@ def tool_shadow(tool: ToolPose, sun: wp.vec3, point: wp.vec3, spread: float) -> 
 
 
 @wp.kernel(enable_backward=False)
-def suns_on_points(
+def sun_visibility_at(
     points: wp.array(dtype=wp.vec3),
     spread: float,
     surface: Surface,
@@ -291,9 +291,9 @@ def illuminate(
         steep = wp.clamp((STEEP - n[2]) / (STEEP - STEEPEST), 0.0, 1.0)
         if steep > 0.0 and found > 0.0 and surface.filling.shape[0] > 0:
             n = wp.normalize(n + steep * (outward(surface, x) - n))
-            seen = look_around(surface, maps, tool, x, n)
+            seen = scan_horizon(surface, maps, tool, x, n)
             # The tool takes the share of its sky that it takes of the cell's.
-            taken = sample(maps.hidden, surface.grid, x[0], x[1])
+            taken = sample(maps.tool_occlusion, surface.grid, x[0], x[1])
             by_tool = seen.sky * taken / wp.max(taken + shade[3], 1.0e-3)
             sky += steep * (seen.sky - by_tool - sky)
             back += steep * (seen.light + by_tool * light.side - back)

@@ -23,8 +23,8 @@ from splatsoil.scene import (
     build_scene,
     encoded,
     kernels,
+    kernels_horizon,
     kernels_relief,
-    kernels_sky,
     kernels_visible,
     linear,
     relief_of_particles,
@@ -178,7 +178,7 @@ def test_other_particles_carry_the_same_picture(scene_of):
 
 def test_kernels_compile_for_cuda(tmp_path):
     """NVRTC comes with Warp, so a compiler error shows without a GPU; sm_90 is an H100 or H200."""
-    for module in (kernels, kernels_relief, kernels_sky, kernels_visible):
+    for module in (kernels, kernels_relief, kernels_horizon, kernels_visible):
         (artifact,) = wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
         assert ".entry" in Path(artifact).read_text()
 
