@@ -256,7 +256,7 @@ class Model:
         posed |= zip(moments, scene.poses(states), strict=True)
         seen = dict(posed)
         if albedo is not None:
-            other = scene.with_other_albedo(albedo)
+            other = scene.with_sampled_albedo(albedo)
             seen = {frame: other.recoloured(moment) for frame, moment in posed.items()}
         keys = [(name, frame) for frame in self.frames for name in cameras]
         pictures = scene.pictures([(seen[frame], cameras[name]) for name, frame in keys])

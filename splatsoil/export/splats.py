@@ -51,7 +51,7 @@ def lit_gaussians(scene: Scene, posed: Posed) -> Gaussians:
     """
     discs, flat = posed.discs
     of_soil = posed.features[:, 3:] > 0.5
-    light = posed.lit.irradiance(posed.centres, 0.5 * scene.spacing)
+    light = posed.shading.irradiance(posed.centres, 0.5 * scene.spacing)
     albedo = posed.features[:, :3]
     colours = torch.where(of_soil, encoded(linear(albedo) * light), albedo)
     tool = encoded(torch.as_tensor(scene.tool_albedo, dtype=torch.float32, device=scene.device))

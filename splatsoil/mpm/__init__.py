@@ -1,4 +1,4 @@
-"""The material point method: sand in a bed, a tool on its measured path, pictures' worth of recorded frames."""
+"""The material point method: sand in a bed and a tool on its measured path."""
 
 from splatsoil.mpm.presets import PRESETS, Preset, Resolution
 from splatsoil.mpm.simulate import Trajectory, frames_around, simulate

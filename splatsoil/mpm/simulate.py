@@ -1,4 +1,4 @@
-"""One call from a measurement set, particles and parameters to recorded frames."""
+"""Simulation of a measurement set: particles and parameters to recorded frames."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ State = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What a simulation leaves behind.
+    """Recorded frames of a simulation, and the tool's force.
 
     Attributes:
         frames: recorded frame numbers.

@@ -2,8 +2,8 @@
 
 Two clocks. Particles and grid exchange state a few times a frame, as often as the motion needs it. Between two
 exchanges, the grid's nodes move in many substeps, as often as the sound waves of the soil's skeleton need it, on frozen
-weights. An exchange by itself loses nothing; what must be damped is damped by the second. So the answer hangs neither
-on stiffness nor on the number of steps; by how much it still does is in docs/numerics.md.
+weights. An exchange by itself loses nothing; what must be damped is damped by the second. So the
+result depends neither on stiffness nor on the number of steps; docs/numerics.md has the remaining dependence.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How soil begins: pressed by what lies above it."""
+"""Initial state of the soil: geostatic stress."""
 
 from __future__ import annotations
 

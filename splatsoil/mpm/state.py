@@ -1,4 +1,4 @@
-"""Arrays of particles and grid, as structures that kernels take whole."""
+"""Warp structs of the state of particles, cells and nodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Kernels that run many times a step, on frozen weights: stress, contact, motion of the nodes."""
+"""Kernels of a substep, with constant weights: stress, contact, motion of the nodes."""
 
 from __future__ import annotations
 

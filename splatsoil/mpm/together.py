@@ -1,4 +1,4 @@
-"""Simulations that share a scene, made together."""
+"""Batches of simulations that share a scene."""
 
 from __future__ import annotations
 

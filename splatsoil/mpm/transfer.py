@@ -1,4 +1,4 @@
-"""Kernels that run once a step: particles to grid, grid to particles."""
+"""Kernels of a step: transfer from particles to grid and from grid to particles."""
 
 from __future__ import annotations
 

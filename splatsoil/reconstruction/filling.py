@@ -1,4 +1,4 @@
-"""From a surface to particles: columns of equal particles between the floor and the surface."""
+"""Particles between the floor and the surface, in columns of equal particles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A surface seen from above: one height a cell."""
+"""Height fields: surfaces with one height a cell."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measured heights on the bed's own cells, without the tool, and the surface that the first of them show."""
+"""Measured heights averaged over cells of the bed, without the tool, and the initial surface from them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What no photograph of the undisturbed bed shows, and a hole dug into it would.
+"""Gaussians of the surroundings that reach into the soil.
 
-Opaque soil hides what lies beneath it, so training is free to leave large Gaussians of the surroundings there, and they
-come to light where a tool digs down to them. But the bed holds soil and nothing else.
+Opaque soil hides what lies beneath it, so training may leave large Gaussians of the surroundings there. They would be
+seen where a tool digs. The bed contains soil alone.
 """
 
 from __future__ import annotations

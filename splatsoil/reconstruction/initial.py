@@ -1,4 +1,4 @@
-"""The first Gaussians: discs on the soil, on the tool, and on what surrounds the bed, coloured by the photographs."""
+"""Initial Gaussians: discs on soil, tool and surroundings, coloured by the photographs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from splatsoil.measurement import Bed
 from splatsoil.reconstruction.height_field import HeightField, around
 from splatsoil.reconstruction.stereo import colours_seen
-from splatsoil.reconstruction.surface import Relief, scale_of
+from splatsoil.reconstruction.surface import Geometry, scale_of
 from splatsoil.reconstruction.views import Views, surface_points
 from splatsoil.splats import Gaussians
 
@@ -79,29 +79,29 @@ def seed_tool(mesh: trimesh.Trimesh, spacing: float, most: int) -> Seeds:
     return Seeds.of(points, np.asarray(mesh.face_normals[face]), spacing, TOOL)
 
 
-def seed_rim(relief: Relief, bed: Bed, spacing: float) -> Seeds:
+def seed_rim(geometry: Geometry, bed: Bed, spacing: float) -> Seeds:
     """Discs on a border around the bed: its top, as high as the walls or the soil beside it; its outer side, down to
     the ground; and the walls' inner sides, down to the soil."""
     parts = []
     lower, upper = bed.lower[:2], bed.upper[:2]
-    for inset in np.arange(0.5 * spacing, relief.rim, spacing):
+    for inset in np.arange(0.5 * spacing, geometry.rim, spacing):
         xy, _ = around(lower - inset, upper + inset, spacing)
-        top = np.column_stack([xy, np.maximum(relief.surface.sample(xy), relief.wall)])
+        top = np.column_stack([xy, np.maximum(geometry.surface.sample(xy), geometry.wall)])
         parts.append(Seeds.of(top, np.tile([0.0, 0.0, 1.0], (len(top), 1)), spacing, SURROUNDINGS))
-    xy, outward = around(lower - relief.rim, upper + relief.rim, spacing)
-    top = np.maximum(relief.surface.sample(xy), relief.wall)
-    parts.append(_upright(xy, outward, np.full(len(xy), relief.ground), top, spacing, SURROUNDINGS))
+    xy, outward = around(lower - geometry.rim, upper + geometry.rim, spacing)
+    top = np.maximum(geometry.surface.sample(xy), geometry.wall)
+    parts.append(_upright(xy, outward, np.full(len(xy), geometry.ground), top, spacing, SURROUNDINGS))
     xy, outward = around(lower, upper, spacing)
     parts.append(
-        _upright(xy, -outward, relief.surface.sample(xy), np.full(len(xy), relief.wall), spacing, SURROUNDINGS)
+        _upright(xy, -outward, geometry.surface.sample(xy), np.full(len(xy), geometry.wall), spacing, SURROUNDINGS)
     )
     return Seeds.join(parts)
 
 
-def seed_sides(relief: Relief, bed: Bed, spacing: float) -> Seeds:
+def seed_sides(geometry: Geometry, bed: Bed, spacing: float) -> Seeds:
     """Discs on the sides of the bed's box, from its floor to the soil's surface."""
     xy, outward = around(bed.lower[:2], bed.upper[:2], spacing)
-    return _upright(xy, outward, np.full(len(xy), bed.lower[2]), relief.surface.sample(xy), spacing, SIDE)
+    return _upright(xy, outward, np.full(len(xy), bed.lower[2]), geometry.surface.sample(xy), spacing, SIDE)
 
 
 def _upright(xy: Array, normals: Array, low: Array, high: Array, spacing: float, label: int) -> Seeds:
@@ -112,14 +112,14 @@ def _upright(xy: Array, normals: Array, low: Array, high: Array, spacing: float,
     return Seeds.of(points, normals[which], spacing, label)
 
 
-def seed_far(views: Views, bed: Bed, relief: Relief) -> Seeds:
+def seed_far(views: Views, bed: Bed, geometry: Geometry) -> Seeds:
     """Discs on the ground and, beyond it, on a sphere around everything, wherever the photographs look.
 
     Every so many pixels a ray is followed to the ground, or to the sphere when it misses or the ground is too far;
     where rays fall close together in angle as seen from their cameras, one disc is kept.
     """
     length = scale_of(bed)
-    centre = np.array([*(bed.lower + bed.upper)[:2] / 2, relief.ground])
+    centre = np.array([*(bed.lower + bed.upper)[:2] / 2, geometry.ground])
     radius = FAR * max(length, float(np.linalg.norm(views.positions.cpu().numpy() - centre, axis=1).max()))
     points, normals, spacings = [], [], []
     for camera in views.cameras:
@@ -128,7 +128,7 @@ def seed_far(views: Views, bed: Bed, relief: Relief) -> Seeds:
         pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
         origin, direction = camera.rays(pixels)
         with np.errstate(divide="ignore", invalid="ignore"):
-            distance = (relief.ground - origin[:, 2]) / direction[:, 2]
+            distance = (geometry.ground - origin[:, 2]) / direction[:, 2]
         landed = origin + distance[:, None] * direction
         on_ground = np.isfinite(distance) & (distance > 0) & (np.linalg.norm(landed - centre, axis=1) < radius)
         offset = origin - centre
@@ -142,7 +142,7 @@ def seed_far(views: Views, bed: Bed, relief: Relief) -> Seeds:
         slant = np.where(on_ground, np.maximum(-direction[:, 2], 0.2), 1.0)
         spacings.append(distance * PIXELS / np.sqrt(camera.fx * camera.fy) / slant**0.5)
     every, facing, spacing = np.concatenate(points), np.concatenate(normals), np.concatenate(spacings)
-    kept = _thinned(every, spacing, bed.beyond(every) > relief.rim)
+    kept = _thinned(every, spacing, bed.beyond(every) > geometry.rim)
     return Seeds.of(every[kept], facing[kept], spacing[kept], SURROUNDINGS)
 
 
@@ -163,19 +163,19 @@ def _thinned(points: Array, spacing: Array, allowed: NDArray[np.bool_]) -> NDArr
     return np.concatenate(result)
 
 
-def disc_colours(views: Views, relief: Relief, seeds: Seeds, *, batch: int = 8192) -> Array:
+def disc_colours(views: Views, geometry: Geometry, seeds: Seeds, *, batch: int = 8192) -> Array:
     """(n, 3) median colour of each disc over the photographs that see it.
 
     Discs that none sees get the colour of the nearest one that is seen.
     """
     colour = np.full((len(seeds.points), 3), np.nan)
-    cell = max(relief.occluder.cell)
+    cell = max(geometry.occluder.cell)
     tool = seeds.label == TOOL
-    for trust, kind in ((relief.trust, np.flatnonzero(~tool)), (views.valid, np.flatnonzero(tool))):
+    for usable, kind in ((geometry.usable, np.flatnonzero(~tool)), (views.valid, np.flatnonzero(tool))):
         for start in range(0, len(kind), batch):
             part = kind[start : start + batch]
             disc = seeds.points[part], seeds.normals[part]
-            colour[part] = colours_seen(views, disc, trust, relief.occluder, 1.5 * cell, 0.5 * cell)
+            colour[part] = colours_seen(views, disc, usable, geometry.occluder, 1.5 * cell, 0.5 * cell)
     blind = np.isnan(colour).any(axis=1)
     if blind.all():
         colour[:] = 0.5
@@ -200,7 +200,7 @@ def discs(seeds: Seeds, colours: Array, opacity: float) -> Gaussians:
 
 
 def first_gaussians(
-    views: Views, bed: Bed, tool: trimesh.Trimesh, relief: Relief, spacing: float, *, sides: bool = False
+    views: Views, bed: Bed, tool: trimesh.Trimesh, geometry: Geometry, spacing: float, *, sides: bool = False
 ) -> tuple[Gaussians, torch.Tensor]:
     """All Gaussians before training, and their labels (n,) int8.
 
@@ -208,15 +208,15 @@ def first_gaussians(
         views: the photographs to train on.
         bed: the box that holds the soil.
         tool: mesh in world coordinates.
-        relief: what stereo found.
+        geometry: what stereo found.
         spacing: distance between the soil's discs, metres.
         sides: whether the soil's sides are seen.
     """
     parts = [
-        seed_soil(relief.surface, bed, spacing),
+        seed_soil(geometry.surface, bed, spacing),
         seed_tool(tool, spacing, most=3000),
-        seed_sides(relief, bed, spacing) if sides else seed_rim(relief, bed, 1.3 * spacing),
-        seed_far(views, bed, relief),
+        seed_sides(geometry, bed, spacing) if sides else seed_rim(geometry, bed, 1.3 * spacing),
+        seed_far(views, bed, geometry),
     ]
     seeds = Seeds.join(parts)
-    return discs(seeds, disc_colours(views, relief, seeds), 0.8), torch.from_numpy(seeds.label)
+    return discs(seeds, disc_colours(views, geometry, seeds), 0.8), torch.from_numpy(seeds.label)

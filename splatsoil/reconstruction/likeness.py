@@ -1,4 +1,4 @@
-"""Whether the fixed cameras see the bed that the photographs show: a photometric check of poses, lenses and scale."""
+"""Photometric check of the fixed cameras' poses, lenses and scale, against the scene reconstructed from the views."""
 
 from __future__ import annotations
 
@@ -18,24 +18,23 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Likeness:
-    """How like what is drawn pictures are where they show soil, by robust correlation.
+    """Robust correlation of pictures with the drawn scene, where they show soil.
 
-    Exposure and white balance, which cameras need not have in common, do not count. Nor do a few pixels, as where a
-    wall of the bin hides soil.
+    It does not depend on exposure and white balance, nor on a few pixels, as where a wall hides soil.
 
     Attributes:
-        upright: (v,) correlation of each picture with what is drawn; NaN where it shows no soil.
-        upside_down: (v,) the same with the drawn soil turned by half a turn in the image: what chance makes alike.
+        correlation: (v,) correlation of each picture with what is drawn; NaN where it shows no soil.
+        control: (v,) the same with the drawn soil turned by half a turn in the image, for the null hypothesis.
     """
 
-    upright: Array
-    upside_down: Array
+    correlation: Array
+    control: Array
 
     def unlike(self, fixed: int) -> Flags:
         """Which of the last ``fixed`` pictures are less like the scene than any other: a rank test, by which one of
         v + 1 is said to differ that does not."""
-        others = self.upright[:-fixed][np.isfinite(self.upright[:-fixed])]
-        return self.upright[-fixed:] < others.min() if len(others) else np.zeros(fixed, dtype=bool)
+        others = self.correlation[:-fixed][np.isfinite(self.correlation[:-fixed])]
+        return self.correlation[-fixed:] < others.min() if len(others) else np.zeros(fixed, dtype=bool)
 
     def unrelated(self, fixed: int) -> Flags:
         """Which of the last ``fixed`` pictures are no more like the scene than any picture is upside down.
@@ -43,20 +42,20 @@ class Likeness:
         A rank test: of pictures that have nothing in common with the scene, one in v + 1 passes. It tells nothing where
         one of the others does not pass.
         """
-        chance = np.max(self.upside_down, initial=-1.0, where=np.isfinite(self.upside_down))
-        told = not np.any(self.upright[:-fixed] <= chance)
-        return (self.upright[-fixed:] <= chance) & told
+        chance = np.max(self.control, initial=-1.0, where=np.isfinite(self.control))
+        told = not np.any(self.correlation[:-fixed] <= chance)
+        return (self.correlation[-fixed:] <= chance) & told
 
 
 def likeness(
-    gaussians: Gaussians, views: Views, trust: torch.Tensor, bed: Bed, level: float, background: tuple[float, ...]
+    gaussians: Gaussians, views: Views, usable: torch.Tensor, bed: Bed, level: float, background: tuple[float, ...]
 ) -> Likeness:
-    """How like the scene each picture is.
+    """Correlation of each picture with the scene.
 
     Args:
         gaussians: the scene, on the device where it is to be drawn.
         views: the pictures.
-        trust: (v, h, w) 1 where they may be used.
+        usable: (v, h, w) 1 where they may be used.
         bed: the box that holds the soil.
         level: height of the soil, metres.
         background: sRGB colour behind all Gaussians.
@@ -70,7 +69,7 @@ def likeness(
             place = (origin + away[:, None] * ray)[:, :2]
             soil = (away > 0.0) & (bed.beyond(place) < 0.0)
         seen = soil.reshape(camera.height, camera.width)
-        seen = seen & (trust[k, : camera.height, : camera.width] > 0.0).cpu().numpy()
+        seen = seen & (usable[k, : camera.height, : camera.width] > 0.0).cpu().numpy()
         if not seen.any():
             out.append((np.nan, np.nan))
             continue

@@ -1,4 +1,4 @@
-"""The whole way from a measurement set to a reconstruction."""
+"""Reconstruction of a measurement set: stereo, training, segmentation, surface."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from splatsoil.reconstruction.likeness import Likeness, likeness
 from splatsoil.reconstruction.presets import preset_named
 from splatsoil.reconstruction.result import HeldOut, Reconstruction
 from splatsoil.reconstruction.sides import sides_seen
-from splatsoil.reconstruction.surface import find_relief, scale_of, soil_mesh, surface_through
+from splatsoil.reconstruction.surface import find_geometry, scale_of, soil_mesh, surface_through
 from splatsoil.reconstruction.training import train
 from splatsoil.reconstruction.views import Views, load_views, silhouettes, still_video, surface_points
 from splatsoil.splats import Gaussians, psnr, rasterise, ssim
@@ -101,14 +101,14 @@ def reconstruct(
     report("finding the tool", 0.0)
     hidden = silhouettes(views, tool)
     container, remarks = bed.container or BIN, []
-    relief = find_relief(views.to(device), bed, hidden, chosen, report, container=container)
-    if bed.container is None and sides_seen(views.to(device), bed, relief):
+    geometry = find_geometry(views.to(device), bed, hidden, chosen, report, container=container)
+    if bed.container is None and sides_seen(views.to(device), bed, geometry):
         container = TRANSPARENT
-        relief = find_relief(views.to(device), bed, hidden, chosen, report, container=container)
+        geometry = find_geometry(views.to(device), bed, hidden, chosen, report, container=container)
         remarks.append(
             "bed: bed.container is not given; photographs show soil at the bed's sides, so transparent walls are taken."
         )
-    spacing = chosen.soil_spacing * max(relief.surface.cell)
+    spacing = chosen.soil_spacing * max(geometry.surface.cell)
     report("placing Gaussians", 0.0)
     cameras: list[str] = []
     still = still_video(measurement, chosen.longest_side)
@@ -116,14 +116,14 @@ def reconstruct(
         # The fixed cameras see sides of things that no photograph needs to show.
         cameras = [camera.name for camera in still.cameras]
         views = views.joined(still)
-        relief = replace(relief, trust=(views.valid * (1.0 - silhouettes(views, tool))).to(device))
+        geometry = replace(geometry, usable=(views.valid * (1.0 - silhouettes(views, tool))).to(device))
     sides = container == TRANSPARENT
-    first, label = first_gaussians(views.to(device), bed, tool, relief, spacing, sides=sides)
+    first, label = first_gaussians(views.to(device), bed, tool, geometry, spacing, sides=sides)
     first = first.to(device)
     if cameras:
         # Before training, which bends the scene to what it is shown.
-        level = float(np.median(relief.surface.height))
-        alike = likeness(first, views, relief.trust, bed, level, NO_BACKGROUND)
+        level = float(np.median(geometry.surface.height))
+        alike = likeness(first, views, geometry.usable, bed, level, NO_BACKGROUND)
         for camera in unlike_cameras(alike, cameras, alike.unrelated(len(cameras))):
             raise MeasurementError(
                 f"the bed that {camera} sees is not that in the views: their poses and lenses must be of one world and"
@@ -131,13 +131,13 @@ def reconstruct(
                 file=measurement.folder,
                 field="video",
             )
-    trained = train(first, label, views, relief.surface, float(bed.lower[2]), chosen, seed, report)
-    on_top, on_tool = segments(trained.gaussians, trained.label, relief.surface, bed, tool)
+    trained = train(first, label, views, geometry.surface, float(bed.lower[2]), chosen, seed, report)
+    on_top, on_tool = segments(trained.gaussians, trained.label, geometry.surface, bed, tool)
     if container == HEAP:
-        on_top &= torch.from_numpy(relief.surface.sample(trained.gaussians.means.numpy()[:, :2]) > bed.lower[2])
-    surface = surface_through(trained.gaussians[on_top], relief.surface)
+        on_top &= torch.from_numpy(geometry.surface.sample(trained.gaussians.means.numpy()[:, :2]) > bed.lower[2])
+    surface = surface_through(trained.gaussians[on_top], geometry.surface)
     if container == HEAP:
-        bare = relief.surface.height <= bed.lower[2]
+        bare = geometry.surface.height <= bed.lower[2]
         surface = replace(surface, height=np.where(bare, bed.lower[2], np.maximum(surface.height, bed.lower[2])))
     soil = on_top | (at_sides(trained.gaussians, trained.label, surface, bed) & ~on_tool) if sides else on_top
     around = torch.nonzero(~soil & ~on_tool)[:, 0]
@@ -148,7 +148,7 @@ def reconstruct(
     if cameras:
         report("comparing with the video", 0.0)
         level = float(np.median(surface.height))
-        alike = likeness(scene, views, relief.trust, bed, level, trained.background)
+        alike = likeness(scene, views, geometry.usable, bed, level, trained.background)
         remarks += [
             f"video: The bed that {camera} sees differs from that in the views; are their poses and lenses of one world"
             " and scale, and is the bed the same?"
@@ -166,7 +166,7 @@ def reconstruct(
         metadata={
             **about,
             "container": container,
-            "ground": relief.ground,
+            "ground": geometry.ground,
             "first_loss": float(np.mean(trained.losses[: len(views)])),
             "last_loss": float(np.mean(trained.losses[-len(views) :])),
             "remarks": remarks,
@@ -184,10 +184,10 @@ def no_gaussians() -> Gaussians:
 
 def unlike_cameras(alike: Likeness, cameras: Sequence[str], which: NDArray[np.bool_]) -> list[str]:
     """Fixed cameras, whose pictures come last, in words: ``which`` of them, and how like the scene theirs are."""
-    usual = np.nanmedian(alike.upright[: -len(cameras)])
+    usual = np.nanmedian(alike.correlation[: -len(cameras)])
     return [
         f"camera {name!r} (its picture correlates with the reconstruction by {value:.2f}, the views by {usual:.2f})"
-        for name, value, said in zip(cameras, alike.upright[-len(cameras) :], which, strict=True)
+        for name, value, said in zip(cameras, alike.correlation[-len(cameras) :], which, strict=True)
         if said
     ]
 

@@ -1,4 +1,4 @@
-"""How much work a reconstruction does."""
+"""Presets of the reconstruction's resolution and effort."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a reconstruction leaves, on disk and in memory."""
+"""The result of a reconstruction, in memory and on disk."""
 
 from __future__ import annotations
 

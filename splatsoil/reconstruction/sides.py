@@ -1,4 +1,4 @@
-"""Whether photographs show soil at the sides of the bed's box, as behind glass."""
+"""Detection of transparent walls: whether photographs show soil at the sides of the bed's box."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from splatsoil.colour import linear
 from splatsoil.measurement import Bed
 from splatsoil.reconstruction.height_field import HeightField, around
 from splatsoil.reconstruction.stereo import colours_seen
-from splatsoil.reconstruction.surface import Relief, scale_of, with_rim
+from splatsoil.reconstruction.surface import Geometry, scale_of, with_rim
 from splatsoil.reconstruction.views import Views
 
 Array = NDArray[np.float64]
@@ -25,7 +25,7 @@ _RING = np.array([0.1, 0.2, 0.3])
 """Where around the bed the ground's colour is looked at, in square roots of the bed's area."""
 
 
-def sides_seen(views: Views, bed: Bed, relief: Relief) -> bool:
+def sides_seen(views: Views, bed: Bed, geometry: Geometry) -> bool:
     """Whether what is seen where the box's sides are, below the soil, has the soil's colour, and the ground around has
     another.
 
@@ -36,9 +36,9 @@ def sides_seen(views: Views, bed: Bed, relief: Relief) -> bool:
     Args:
         views: the photographs.
         bed: the box.
-        relief: the soil's surface, found as if walls hid its sides.
+        geometry: the soil's surface, found as if walls hid its sides.
     """
-    surface, floor = relief.surface, float(bed.lower[2])
+    surface, floor = geometry.surface, float(bed.lower[2])
     level = float(np.median(surface.height))
     cell = max(surface.cell)
     xy, outward = around(bed.lower[:2], bed.upper[:2], cell)
@@ -47,14 +47,14 @@ def sides_seen(views: Views, bed: Bed, relief: Relief) -> bool:
     heights = floor + top[:, None] * np.array([0.25, 0.5, 0.75, 1.0])
     side = np.concatenate([np.column_stack([xy, z]) for z in heights.T])
     flat = replace(surface, height=np.full_like(surface.height, level))
-    seen = _chromaticity(views, (side, np.tile(outward, (4, 1))), relief.trust, with_rim(flat, bed, 0.0))
+    seen = _chromaticity(views, (side, np.tile(outward, (4, 1))), geometry.usable, with_rim(flat, bed, 0.0))
     cells = surface.points.reshape(-1, 3), surface.normals.reshape(-1, 3)
-    soil = _chromaticity(views, cells, relief.trust, relief.occluder)
+    soil = _chromaticity(views, cells, geometry.usable, geometry.occluder)
     length = scale_of(bed)
     ring = np.concatenate([around(bed.lower[:2] - out, bed.upper[:2] + out, cell)[0] for out in _RING * length])
-    ground = np.column_stack([ring, np.full(len(ring), relief.ground)])
+    ground = np.column_stack([ring, np.full(len(ring), geometry.ground)])
     upward = np.tile([0.0, 0.0, 1.0], (len(ground), 1))
-    beside = _chromaticity(views, (ground, upward), relief.trust, with_rim(flat, bed, relief.rim))
+    beside = _chromaticity(views, (ground, upward), geometry.usable, with_rim(flat, bed, geometry.rim))
     return _alike(seen, soil) and not _alike(beside, soil)
 
 
@@ -67,9 +67,9 @@ def _alike(some: Array, others: Array) -> bool:
     return bool(apart @ np.linalg.pinv(spread) @ apart < _ALIKE)
 
 
-def _chromaticity(views: Views, discs: tuple[Array, Array], trust: torch.Tensor, occluder: HeightField) -> Array:
+def _chromaticity(views: Views, discs: tuple[Array, Array], usable: torch.Tensor, occluder: HeightField) -> Array:
     """Red and green (m, 2) of the sum of linear red, green and blue, of those of n discs that are seen."""
     near = 0.1 * max(occluder.cell)
-    seen = colours_seen(views, discs, trust, occluder, near, near)
+    seen = colours_seen(views, discs, usable, occluder, near, near)
     colours = linear(seen[np.isfinite(seen).all(axis=1)])
     return colours[:, :2] / np.maximum(colours.sum(axis=1, keepdims=True), 1e-6)

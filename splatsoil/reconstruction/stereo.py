@@ -1,10 +1,9 @@
-"""Multi-view stereo on a height field: which height makes the photographs agree on what a cell looks like?
+"""Multi-view stereo on a height field.
 
-Soil seen from above is a height field, so the search is one-dimensional in every cell. Each photograph is drawn onto a
-candidate surface and the drawings are compared there in small windows, after the local mean of each drawing is taken
-out (light falls off towards a lens's edge, and exposures differ). Photographs that do not see a cell (beyond their
-border, behind the tool, behind a wall or a ridge) are left out; what is left of such disagreement is met by robust
-weights.
+Soil seen from above is a height field, so the search in each cell is one-dimensional. Each photograph is projected onto
+a candidate surface. The projections are compared there in small windows, each less its local mean, as exposures and
+vignetting differ. Photographs that do not show a cell (outside of the image, behind the tool, a wall or a ridge) are
+left out; robust weights reduce the effect of other outliers.
 
 Two stages: a sweep over the whole height range, solved together with a smoothness term by alternation (quadratic
 relaxation, as in DTAM, Newcombe et al., ICCV 2011); then Gauss-Newton on the same cost with a thin-plate prior, whose
@@ -53,14 +52,14 @@ def _blur(values: torch.Tensor, window: torch.Tensor) -> torch.Tensor:
     return flat.reshape(shape)
 
 
-def draw(views: Views, points: torch.Tensor, trust: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def draw(views: Views, points: torch.Tensor, usable: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """The photographs as seen at points: colours (v, 3, ny, nx) and whether each is to be trusted (v, ny, nx) in {0,
     1}.
 
     Args:
         views: the photographs.
         points: (ny, nx, 4) homogeneous world points.
-        trust: (v, h, w) 1 where a pixel may be used.
+        usable: (v, h, w) 1 where a pixel may be used.
     """
     pixels = torch.einsum("vij,yxj->vyxi", views.projection, points)
     depth = pixels[..., 2]
@@ -71,7 +70,7 @@ def draw(views: Views, points: torch.Tensor, trust: torch.Tensor) -> tuple[torch
     # one by one: to put them together would take as long as to draw them
     drawn, sure = (
         functional.grid_sample(maps, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
-        for maps in (views.images, trust[:, None])
+        for maps in (views.images, usable[:, None])
     )
     return drawn, ((sure[:, 0] > 0.999) & (depth > 0)).to(torch.float32)
 
@@ -83,7 +82,7 @@ class Matching:
     Attributes:
         views: the photographs.
         grid: the cells whose heights are sought; its own heights do not count.
-        trust: (v, h, w) 1 where a pixel may be used.
+        usable: (v, h, w) 1 where a pixel may be used.
         weight: (v, ny, nx) what each photograph counts at each cell.
         normalised: whether differences are divided by what the two vary by, as in normalised cross-correlation: plain
             ground then agrees with nothing, where else it agrees with itself at any height.
@@ -91,7 +90,7 @@ class Matching:
 
     views: Views
     grid: HeightField
-    trust: torch.Tensor
+    usable: torch.Tensor
     weight: torch.Tensor
     normalised: bool = False
 
@@ -111,7 +110,7 @@ class Matching:
         """
         surface = replace(self.grid, height=np.broadcast_to(height, self.grid.height.shape)).points
         points = torch.tensor(surface, dtype=torch.float32, device=self.weight.device)
-        colours, seen = draw(self.views, functional.pad(points, (0, 1), value=1.0), self.trust)
+        colours, seen = draw(self.views, functional.pad(points, (0, 1), value=1.0), self.usable)
         weight = (self.weight * seen)[:, None]
         near, wide = _window(sigma), _window(max(2.0 * sigma, 4.0))
         if not levels:
@@ -246,20 +245,20 @@ def shrunk(total: Array, count: Array) -> Array:
 
 
 def colours_seen(
-    views: Views, discs: tuple[Array, Array], trust: torch.Tensor, occluder: HeightField, lift: float, clearance: float
+    views: Views, discs: tuple[Array, Array], usable: torch.Tensor, occluder: HeightField, lift: float, clearance: float
 ) -> Array:
     """(n, 3) median colour of discs over the photographs that see their fronts; NaN where none does.
 
     Args:
         views: the photographs.
         discs: (n, 3) centres and (n, 3) normals, metres.
-        trust: (v, h, w) 1 where a pixel may be used.
+        usable: (v, h, w) 1 where a pixel may be used.
         occluder: what may hide discs.
         lift: how far along its normal a disc is looked for: the occluder is as coarse as its cells, metres.
         clearance: see `visibility`.
     """
     points, normals = (torch.tensor(a, dtype=torch.float32, device=views.images.device) for a in discs)
-    drawn, sure = draw(views, functional.pad(points, (0, 1), value=1.0)[None], trust)
+    drawn, sure = draw(views, functional.pad(points, (0, 1), value=1.0)[None], usable)
     facing = ((views.positions[:, None] - points) * normals).sum(-1) > 0
     weight = sure[:, 0] * facing * visibility(views, discs[0] + lift * discs[1], occluder, clearance=clearance)
     known = torch.where((weight > 0)[:, None], drawn[:, :, 0], torch.nan)

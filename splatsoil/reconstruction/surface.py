@@ -1,4 +1,4 @@
-"""From photographs to the soil's surface: silhouettes of the tool, stereo in the bed, what may hide what."""
+"""Geometry from photographs: the soil's surface by stereo, the walls around it, the level of the ground."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ DOUBTFUL = 3.0  # times the median standard deviation: at the bed's border, the 
 
 
 @dataclass(frozen=True)
-class Relief:
-    """What the photographs say about shapes before any Gaussian is trained.
+class Geometry:
+    """Geometry of the scene by stereo, before any Gaussian is trained.
 
     Attributes:
         surface: the soil's surface over the bed's box, with standard deviations.
         occluder: `surface` with a rim as high as the walls or the soil beside it, and far below everything beyond.
         ground: height of the level ground around the bed, metres.
-        trust: (v, h, w) float32, 1 where a photograph shows no tool and may be used.
+        usable: (v, h, w) float32, 1 where a photograph shows no tool and may be used.
         rim: the rim's width, metres.
         wall: height of the walls' top, metres; minus infinity without walls.
     """
@@ -49,7 +49,7 @@ class Relief:
     surface: HeightField
     occluder: HeightField
     ground: float
-    trust: torch.Tensor
+    usable: torch.Tensor
     rim: float
     wall: float
 
@@ -65,9 +65,9 @@ def footprint(views: Views, bed: Bed) -> float:
     return float(np.median([np.linalg.norm(c.position - centre) / np.sqrt(c.fx * c.fy) for c in views.cameras]))
 
 
-def find_relief(
+def find_geometry(
     views: Views, bed: Bed, tool_silhouettes: torch.Tensor, preset: Preset, report: Report, *, container: str = BIN
-) -> Relief:
+) -> Geometry:
     """Heights of the soil over the bed's box.
 
     Args:
@@ -76,16 +76,16 @@ def find_relief(
         tool_silhouettes: (v, h, w) 1 where the tool hides what is behind it.
         preset: how much work.
         report: called with what is being done and how much of it is done.
-        container: what holds the soil, see `measurement.Bed`. Where no wall is seen around it, photographs look past
-            its edge at the ground behind.
+        container: what holds the soil, see `measurement.Bed`. Without walls, photographs show the ground behind its
+            edge.
 
     Raises:
-        MeasurementError: the photographs are too far away, or tell no height in half of the bed or more.
+        MeasurementError: the photographs are too far away, or determine no height in half of the bed or more.
     """
     length, device = scale_of(bed), views.images.device
     bare = container in (TRANSPARENT, HEAP)
     cell = max(length / preset.cells**0.5, 1.2 * footprint(views, bed))
-    trust = views.valid * (1.0 - tool_silhouettes.to(device))
+    usable = views.valid * (1.0 - tool_silhouettes.to(device))
     step = float(bed.upper[2] - bed.lower[2]) / (preset.candidates - 1)
     coarse = HeightField.over(bed.lower, bed.upper, 2.0 * cell)
     if min(coarse.height.shape) < CELLS:
@@ -94,7 +94,7 @@ def find_relief(
             " relief; take them from nearer, and see that their poses are in metres",
             field="views",
         )
-    matching = Matching(views, coarse, trust, torch.ones(len(views), *coarse.height.shape, device=device), bare)
+    matching = Matching(views, coarse, usable, torch.ones(len(views), *coarse.height.shape, device=device), bare)
     report("sweeping the bed's height", 0.0)
     height = matching.sweep(np.linspace(bed.lower[2], bed.upper[2], preset.candidates), sigma=1.5)
     report("refining heights", 0.4)
@@ -104,22 +104,22 @@ def find_relief(
     fine = HeightField.over(bed.lower, bed.upper, cell)
     height = replace(coarse, height=height).smooth(fine.points[..., :2])
     rim = 0.0 if bare else RIM * length
-    wall = wall_top(views, bed, trust) if container == BIN else -np.inf
+    wall = wall_top(views, bed, usable) if container == BIN else -np.inf
     for last in (False, True):
         report("refining heights", 0.6 + 0.2 * last)
         now = replace(fine, height=height)
         seen = visibility(views, now.points.reshape(-1, 3), with_rim(now, bed, rim, wall), clearance=1.5 * cell)
-        matching = Matching(views, fine, trust, seen.reshape(len(views), *height.shape), bare)
+        matching = Matching(views, fine, usable, seen.reshape(len(views), *height.shape), bare)
         height, deviation = matching.refine(height, reach=0.5 * step, length=length, iterations=6 if last else 3)
         height, deviation = without_backdrop(height, deviation, length)
     # Around a heap the floor is bare: what is less high than a cell is wide is not told from it.
     least = bed.lower[2] + (0.5 * cell if container == HEAP else 0.0)
     surface = replace(fine, height=np.where(height > least, height, bed.lower[2]), deviation=deviation)
     occluder = with_rim(surface, bed, rim, wall)
-    return Relief(surface, occluder, ground_level(views, bed, surface, occluder, rim), trust, rim, wall)
+    return Geometry(surface, occluder, ground_level(views, bed, surface, occluder, rim), usable, rim, wall)
 
 
-def wall_top(views: Views, bed: Bed, trust: torch.Tensor) -> float:
+def wall_top(views: Views, bed: Bed, usable: torch.Tensor) -> float:
     """Height of the walls' top, metres, by a plane sweep (Collins 1996) along their inner edge.
 
     Photographs agree on the colour of a place that is on an opaque body, and mostly of one within a plain one, but not
@@ -129,7 +129,7 @@ def wall_top(views: Views, bed: Bed, trust: torch.Tensor) -> float:
     Args:
         views: the photographs.
         bed: the box; its walls are equally high.
-        trust: (v, h, w) 1 where a pixel may be used.
+        usable: (v, h, w) 1 where a pixel may be used.
     """
     step = footprint(views, bed)
     edge, _ = around(bed.lower[:2] - step, bed.upper[:2] + step, 2.0 * step)
@@ -139,7 +139,7 @@ def wall_top(views: Views, bed: Bed, trust: torch.Tensor) -> float:
     places[..., 2] = z[:, None]
     swept = []
     for some in places.split(ROWS):
-        colours, seen = draw(views, some, trust)
+        colours, seen = draw(views, some, usable)
         count = seen.sum(dim=0)
         mean = (colours * seen[:, None]).sum(dim=0) / count.clamp_min(1.0)
         error = torch.log1p(((colours - mean) ** 2).sum(dim=1) / (27.0 * views.noise**2))

@@ -1,4 +1,4 @@
-"""The photographs as one batch of tensors, free of distortion, with the pixels that must not be trusted marked."""
+"""The photographs as one batch of tensors, free of distortion, with a mask of valid pixels."""
 
 from __future__ import annotations
 

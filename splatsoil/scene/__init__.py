@@ -1,4 +1,4 @@
-"""From moved particles to pictures: Gaussians that ride on particles, lit by sun and sky, with the tool among them."""
+"""The renderer: Gaussians that move with particles, shaded by sun and sky, with the tool among them."""
 
 from splatsoil.scene.binding import Binding, bind
 from splatsoil.scene.build import build_scene
@@ -7,9 +7,9 @@ from splatsoil.scene.ground import ground_of_pixels
 from splatsoil.scene.intrinsic import Intrinsic
 from splatsoil.scene.layers import Layers, Posed
 from splatsoil.scene.light import Light, encoded, linear
-from splatsoil.scene.lit import LitRelief, light_relief
 from splatsoil.scene.relief import Relief, relief_of_particles
 from splatsoil.scene.render import Scene
+from splatsoil.scene.shading import Shading, shade
 from splatsoil.scene.tool import ToolBody, silhouette
 
 __all__ = [
@@ -17,20 +17,20 @@ __all__ = [
     "Intrinsic",
     "Layers",
     "Light",
-    "LitRelief",
     "Posed",
     "Relief",
     "Scene",
+    "Shading",
     "ToolBody",
     "bind",
     "build_scene",
     "encoded",
     "estimate_light",
     "ground_of_pixels",
-    "light_relief",
     "linear",
     "relief_of_particles",
     "seen_colours",
+    "shade",
     "silhouette",
     "still_frames",
 ]

@@ -1,4 +1,4 @@
-"""Albedo from colours: what the soil's Gaussians, the grains beneath them and the tool would show in even light."""
+"""Albedo of the soil's Gaussians, of the particles beneath them and of the tool, from their colours."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ BRIGHTEST = 2.0
 OUTLYING = 3.0
 """Standard deviations beyond which a place counts as no farther from the median."""
 
-WAVES = 256
-"""Of a random field."""
+FOURIER_TERMS = 256
+"""Of a random field, whose spectral representation is a sum of so many waves."""
 
 LONGEST = 0.1
 """Blotches of albedo wider than this count as this wide, m."""
@@ -65,7 +65,7 @@ def correlation_length(points: Tensor, values: Tensor, longest: float) -> float:
 
 
 class SurfaceAlbedo:
-    """Albedo of the undisturbed surface as a map over the bed, and what it lets guess of the soil beneath.
+    """Albedo of the undisturbed surface as a map over the bed, and its extrapolation to the soil beneath.
 
     Args:
         centres: (n, 3) the surface's Gaussians, m.
@@ -115,29 +115,27 @@ class SurfaceAlbedo:
         return found[0, :, 0].T.contiguous()
 
     def beneath(self, points: Tensor, depth: Tensor) -> Tensor:
-        """Linear albedo (p, 3) guessed of soil at points (p, 3), m, so deep (p,), m, below the surface.
+        """Expected linear albedo (p, 3) of soil at points (p, 3), m, at depths (p,) below the surface, m.
 
-        The surface's blotches are taken to reach as deep as they are wide: at a depth d the guess is the mean plus
-        exp(−d/length) times what the surface above deviates from it. That is the best linear guess where the
-        correlation falls so, and it tends to the mean, as it must, where nothing is known.
+        The correlation is taken to fall with depth as it does along the surface. At a depth d the best linear
+        prediction is the mean plus exp(−d/length) times the deviation of the surface above from it.
         """
         share = torch.exp(-depth.clamp_min(0.0) / self.length)[:, None]
         return self.mean + share * (self.above(points) - self.mean)
 
 
-def other_grain_albedo(
-    grains: Tensor, depth: Tensor, guess: Tensor, above: Tensor, length: float, generator: np.random.Generator
+def sampled_albedo(
+    grains: Tensor, depth: Tensor, expected: Tensor, above: Tensor, length: float, generator: np.random.Generator
 ) -> Tensor:
-    """Albedo that particles could have just as well as the guess.
+    """A random sample of the unknown albedo of buried soil.
 
-    Beneath the surface blotches go on that no photograph shows. The guess is multiplied with a random field of the
-    surface's own variance and an exponential correlation, of which the share 1 − exp(−2 d/length) of the variance is
-    left open at a depth d: together with the guess, the correlation of `SurfaceAlbedo`.
+    The expected albedo is multiplied with a log-normal random field of the surface's variance and an exponential
+    correlation. At a depth d the share 1 − exp(−2 d/length) of the variance is unknown, as in `SurfaceAlbedo`.
 
     Args:
         grains: (p, 3) particles, m.
         depth: (p,) below the surface, m.
-        guess: (p, 3) linear albedo from `SurfaceAlbedo.beneath`; its mean is kept.
+        expected: (p, 3) linear albedo from `SurfaceAlbedo.beneath`; its mean is kept.
         above: (p, 3) linear albedo of the surface above each.
         length: correlation length of the surface's albedo, m.
         generator: of the field.
@@ -150,7 +148,7 @@ def other_grain_albedo(
     field = torch.stack([_random_field(grains, length, generator) for _ in range(3)], dim=1) @ mixing
     open_variance = (1.0 - torch.exp(-2.0 * depth.clamp_min(0.0) / length))[:, None]
     variance = open_variance * mixing.square().sum(dim=0)
-    return guess * torch.exp(open_variance.sqrt() * field - 0.5 * variance)
+    return expected * torch.exp(open_variance.sqrt() * field - 0.5 * variance)
 
 
 def _log_covariance(albedo: FloatArray) -> FloatArray:
@@ -164,10 +162,12 @@ def _log_covariance(albedo: FloatArray) -> FloatArray:
 def _random_field(points: Tensor, length: float, generator: np.random.Generator) -> Tensor:
     """(n,) Gaussian field of variance 1 and correlation exp(-distance/length) at points (n, 3), m: a sum of waves."""
     # exp(-|x|) in space is the characteristic function of Cauchy's distribution there
-    waves = generator.standard_normal((WAVES, 3)) / np.abs(generator.standard_normal((WAVES, 1))) / length
-    phases = generator.uniform(0.0, 2.0 * np.pi, WAVES)
+    waves = (
+        generator.standard_normal((FOURIER_TERMS, 3)) / np.abs(generator.standard_normal((FOURIER_TERMS, 1))) / length
+    )
+    phases = generator.uniform(0.0, 2.0 * np.pi, FOURIER_TERMS)
     turns, starts = (torch.from_numpy(a).float().to(points.device) for a in (waves.T.copy(), phases))
-    return math.sqrt(2.0 / WAVES) * torch.cos(points @ turns + starts).sum(dim=1)
+    return math.sqrt(2.0 / FOURIER_TERMS) * torch.cos(points @ turns + starts).sum(dim=1)
 
 
 def refined(

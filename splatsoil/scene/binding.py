@@ -1,4 +1,4 @@
-"""Gaussians that ride on particles.
+"""Linear blend skinning: Gaussians that move with particles.
 
 A Gaussian of the reconstruction rests at X with covariance Σ. Its particles p (the nearest at rest) have moved from X_p
 to x_p and deformed by F_p (the visual deformation). With weights w that sum to 1,

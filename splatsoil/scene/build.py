@@ -1,4 +1,4 @@
-"""A scene out of a reconstruction: light, albedo and binding, from photographs of the undisturbed bed."""
+"""A scene from a reconstruction and photographs of the undisturbed bed: illumination, albedo, binding."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from splatsoil.scene.estimate import estimate_light, still_frames
 from splatsoil.scene.intrinsic import Intrinsic
 from splatsoil.scene.layers import Posed
 from splatsoil.scene.light import Light, encoded, linear
-from splatsoil.scene.lit import LitRelief, light_relief
 from splatsoil.scene.relief import Relief, relief_of_particles
 from splatsoil.scene.render import Scene, nearer_side, to_sides
+from splatsoil.scene.shading import Shading, shade
 from splatsoil.scene.tool import ToolBody
 from splatsoil.splats import Gaussians
 
@@ -100,8 +100,8 @@ def build_scene(
     with torch.no_grad():
         posed = scene.pose(x, None, start)
         scene = scene.replace(tool_albedo=albedos.tool_albedo(frames, lambda camera: scene.layers(posed, camera).tool))
-        lit = light_relief(relief, light, body.at(*start), scene.tool_albedo)
-        scene = scene.replace(**_albedo(soil, lit, scene))
+        shading = shade(relief, light, body.at(*start), scene.tool_albedo)
+        scene = scene.replace(**_albedo(soil, shading, scene))
         return _refined(scene, scene.pose(x, None, start), frames)
 
 
@@ -116,21 +116,21 @@ def _side_light(soil: Gaussians, relief: Relief, light: Light, bed: Bed) -> Floa
     return torch.stack(means).cpu().numpy().astype(np.float64) / light.level
 
 
-def _albedo(soil: Gaussians, lit: LitRelief, scene: Scene) -> dict[str, Tensor]:
+def _albedo(soil: Gaussians, shading: Shading, scene: Scene) -> dict[str, Tensor]:
     """First albedo of soil and grains: the reconstruction's colours with the light on them taken out."""
     grains, bed = scene.soil.particles, scene.bed
-    light = lit.irradiance(soil.means.contiguous(), _FOOTPRINT)
+    light = shading.irradiance(soil.means.contiguous(), _FOOTPRINT)
     on_top = torch.ones(len(soil), dtype=torch.bool, device=light.device)
     if scene.side_light is not None:
-        side = nearer_side(soil.means, lit.relief, bed)
+        side = nearer_side(soil.means, shading.relief, bed)
         on_top = side < 0
         light[~on_top] = torch.from_numpy(scene.side_light).to(light)[side[~on_top]]
     albedo = (linear(soil.colours) / light.clamp_min(0.05)).clamp(0.0, albedos.BRIGHTEST)
     surface = albedos.SurfaceAlbedo(soil.means[on_top], albedo[on_top], scene.spacing, bed.lower, bed.upper)
-    beneath = surface.beneath(grains, lit.relief.depth_below(grains))
+    beneath = surface.beneath(grains, shading.relief.depth_below(grains))
     if not on_top.all():
         # The layer behind a side that is seen has its colours.
-        behind = nearer_side(grains, lit.relief, bed) >= 0
+        behind = nearer_side(grains, shading.relief, bed) >= 0
         behind &= to_sides(grains, bed)[0] < scene.spacing
         k = min(_NEAREST, int((~on_top).sum()))
         _, nearest = cKDTree(soil.means[~on_top].cpu().numpy()).query(
@@ -152,7 +152,7 @@ def _refined(scene: Scene, posed: Posed, frames: list[Frame]) -> Scene:
         sure = (layers.soil > 0.95) & (tool == 0.0) & good
         unlit = encoded((linear(image) / layers.light.clamp_min(0.05)).clamp(0.0, albedos.BRIGHTEST))
         targets.append((camera, unlit, sure.float()))
-    shown, near = scene.shown(posed.lit.relief, scene.soil.rest, scene.soil.particles)
+    shown, near = scene.shown(posed.shading.relief, scene.soil.rest, scene.soil.particles)
     count = int(shown.sum()) + int(near.sum())
     parts = (posed.centres[:count], posed.covariances[:count], posed.opacities[:count])
     found = albedos.refined(*parts, posed.features[:count, :3], targets)

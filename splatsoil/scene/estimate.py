@@ -1,4 +1,4 @@
-"""The light estimated from photographs: what they show of points all over the bed that nothing has moved."""
+"""Illumination estimated from photographs of undisturbed soil."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torch import Tensor
 from splatsoil.measurement import Frame, Measurement
 from splatsoil.scene import kernels
 from splatsoil.scene.light import Light, linear
-from splatsoil.scene.light_fit import FINEST, LAG, Passing, fit_light
+from splatsoil.scene.light_fit import FINEST, LAG, MovedShadow, fit_light
 from splatsoil.scene.relief import Relief
 from splatsoil.scene.tool import ToolBody
 from splatsoil.splats.warp_torch import as_warp, launch
@@ -36,7 +36,7 @@ _BLUR = 1.5
 _CLEARANCE = 0.005
 """Between the tool and soil that it has not touched yet, m: more than the surface is known to."""
 
-_PASSING = 5
+_MOVED_SHADOWS = 5
 """Frames at which the tool's shadow on untouched soil is looked at, at most."""
 
 _WEDGE = 2.5
@@ -103,15 +103,17 @@ def estimate_light(measurement: Measurement, relief: Relief, body: ToolBody) -> 
     across = float((points[1] - points[0]).norm())
     blur = max(1, math.ceil(_BLUR * pixel / across))
     alone = untouched(measurement, points, relief, body, _moments(measurement.frames[1:]))
-    passing = [p for frame, rest in alone.items() for p in _passing(measurement, points, relief, body, frame, rest)]
-    return fit_light(points, colours, shape, relief, tool, blur=blur, passing=passing)
+    shadows = [
+        s for frame, rest in alone.items() for s in _moved_shadows(measurement, points, relief, body, frame, rest)
+    ]
+    return fit_light(points, colours, shape, relief, tool, blur=blur, moved_shadows=shadows)
 
 
 def _moments(later: Sequence[int]) -> list[int]:
     """Some of the video's frames after the first, most of them early, when little has moved; of many, none later than
     half way."""
-    last = max(len(later) / 2, min(_PASSING, len(later)), 1.0)
-    return sorted({later[round(place) - 1] for place in np.geomspace(1.0, last, _PASSING)}) if later else []
+    last = max(len(later) / 2, min(_MOVED_SHADOWS, len(later)), 1.0)
+    return sorted({later[round(place) - 1] for place in np.geomspace(1.0, last, _MOVED_SHADOWS)}) if later else []
 
 
 def untouched(
@@ -149,11 +151,10 @@ def untouched(
     return out
 
 
-def _passing(
+def _moved_shadows(
     measurement: Measurement, points: Tensor, relief: Relief, body: ToolBody, frame: int, alone: Tensor
-) -> list[Passing]:
-    """What each of the video's cameras says at a frame of the points that are left alone, compared with its own still
-    frames."""
+) -> list[MovedShadow]:
+    """Of each of the video's cameras: log brightness of undisturbed points over that in its still frames."""
     motion, rate = measurement.tool.motion, measurement.frame_rate
     then, rest = (body.at(*motion.pose(time)) for time in (frame / rate, float(motion.times[0])))
     still = still_frames(measurement)
@@ -167,7 +168,7 @@ def _passing(
                 for frames, tool in ((after, then), (before, rest))
             )
             shown[~alone] = math.nan
-            out.append(Passing(then, shown - known))
+            out.append(MovedShadow(then, shown - known))
     return out
 
 

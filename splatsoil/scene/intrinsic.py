@@ -1,4 +1,4 @@
-"""What photographs say of light and albedo, on file: it takes seconds to estimate and hangs on no parameter."""
+"""Illumination and albedo on file: their estimate takes seconds and depends on no parameter."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Intrinsic:
-    """A scene's light and albedo, parted (an intrinsic decomposition).
+    """A scene's intrinsic decomposition: illumination and albedo.
 
     Attributes:
         light: sun and sky.

@@ -1,6 +1,6 @@
 # mypy: ignore-errors
 # (Warp reads the annotations of kernels as types of its own)
-"""Warp kernels of light and shade; the same source runs on CPU and CUDA.
+"""Warp kernels of shading, shadows and the tool; the same source runs on CPU and CUDA.
 
 Every kernel is a gather: each thread writes its own outputs, so results do not depend on the order of threads.
 """
@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import warp as wp
 
+from splatsoil.scene.kernels_horizon import scan_horizon
 from splatsoil.scene.kernels_maps import Maps, Surface, ToolPose, cell_centre, height_at, outward, sample
-from splatsoil.scene.kernels_sky import look_around
 
 STEEP, STEEPEST = wp.constant(0.7), wp.constant(0.5)
 """Upward parts of normals (45°, 60°) between which a surface's slope is less and less that of its heights."""
@@ -35,10 +35,11 @@ class Illumination:
 
 @wp.struct
 class Pixels:
-    """What splats say of each pixel (depth and share of soil), and what is found for it: light on its soil, and the
-    tool's radiance times its share of the pixel with that share."""
+    """What splats say of each pixel (depth, share of soil, and alpha of those before the tool), and what is found for
+    it: light on its soil, and the tool's radiance times its share of the pixel with that share."""
 
     depth: wp.array2d(dtype=wp.float32)
+    before: wp.array2d(dtype=wp.float32)
     soil: wp.array2d(dtype=wp.float32)
     light: wp.array2d(dtype=wp.vec3)
     tool: wp.array2d(dtype=wp.vec4)
@@ -65,6 +66,19 @@ def tool_hit(tool: ToolPose, origin: wp.vec3, direction: wp.vec3, reach: float) 
     if query.result:
         return query.t
     return -1.0
+
+
+@wp.kernel(enable_backward=False)
+def nearest_of_tool(tool: ToolPose, points: wp.array(dtype=wp.vec3), nearest: wp.array(dtype=wp.vec3)) -> None:
+    """The tool's point nearest to each point; of points outside of the sphere around it, that sphere's middle."""
+    k = wp.tid()
+    nearest[k] = tool.centre
+    if tool.mesh != wp.uint64(0) and wp.length(points[k] - tool.centre) < tool.radius:
+        local = wp.transpose(tool.rotation) * (points[k] - tool.position)
+        query = wp.mesh_query_point_no_sign(tool.mesh, local, 2.0 * tool.radius)
+        if query.result:
+            found = wp.mesh_eval_position(tool.mesh, query.face, query.u, query.v)
+            nearest[k] = tool.rotation * found + tool.position
 
 
 @wp.func
@@ -134,7 +148,7 @@ def tool_shadow(tool: ToolPose, sun: wp.vec3, point: wp.vec3, spread: float) -> 
 
 
 @wp.kernel(enable_backward=False)
-def suns_on_points(
+def sun_visibility_at(
     points: wp.array(dtype=wp.vec3),
     spread: float,
     surface: Surface,
@@ -277,9 +291,9 @@ def illuminate(
         steep = wp.clamp((STEEP - n[2]) / (STEEP - STEEPEST), 0.0, 1.0)
         if steep > 0.0 and found > 0.0 and surface.filling.shape[0] > 0:
             n = wp.normalize(n + steep * (outward(surface, x) - n))
-            seen = look_around(surface, maps, tool, x, n)
+            seen = scan_horizon(surface, maps, tool, x, n)
             # The tool takes the share of its sky that it takes of the cell's.
-            taken = sample(maps.hidden, surface.grid, x[0], x[1])
+            taken = sample(maps.tool_occlusion, surface.grid, x[0], x[1])
             by_tool = seen.sky * taken / wp.max(taken + shade[3], 1.0e-3)
             sky += steep * (seen.sky - by_tool - sky)
             back += steep * (seen.light + by_tool * light.side - back)
@@ -297,16 +311,18 @@ def illuminate(
     # A pixel's corner lies less than 1.5 of its width off its axis.
     if not near_tool(tool, eye.position, axis, 1.5 * (wp.length(tool.centre - eye.position) + tool.radius) / eye.fx):
         return
+    # Soil is opaque: what shines through between its Gaussians is not there.
+    if pixels.before[i, j] > 0.5:
+        return
     share = float(0.0)
     radiance = wp.vec3(0.0, 0.0, 0.0)
     for k in range(4):
         sx = wp.where(k % 2 == 0, -0.25, 0.25)
         sy = wp.where(k < 2, -0.25, 0.25)
         fine = pixel_ray(eye, float(j) + 0.5 + 0.8 * sx - 0.6 * sy, float(i) + 0.5 + 0.6 * sx + 0.8 * sy)
-        length = wp.length(fine)
-        way = fine / length
+        way = wp.normalize(fine)
         t = tool_hit(tool, eye.position, way, 1.0e3)
-        if t >= 0.0 and (t / length < z or z <= 0.0):
+        if t >= 0.0:
             share += 0.25
             point = eye.position + way * t
             n = tool_normal(tool, eye.position, way)

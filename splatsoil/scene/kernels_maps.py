@@ -1,6 +1,6 @@
 # mypy: ignore-errors
 # (Warp reads the annotations of kernels as types of its own)
-"""The soil's surface in the form of Warp's kernels, and what maps over the bed say between their cells."""
+"""Warp structs of the soil's surface and its shading maps, and their interpolation between cells."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Surface:
 
 
 Shade = wp.types.vector(length=8, dtype=wp.float32)
-"""What decides the light on a place: normal, shares of sky and sun, and light from soil and tool (red, green, blue)."""
+"""Shading of a cell: normal, visibility of sky and sun, and interreflection (red, green, blue)."""
 
 
 @wp.struct
@@ -55,15 +55,15 @@ class Maps:
 
     Attributes:
         shades: what light reaches them.
-        sent: light that they send back.
+        radiosity: light that they send back.
         columns: lowest and highest point of the tool over each.
-        hidden: share of the sky that the tool takes.
+        tool_occlusion: share of the sky that the tool takes.
     """
 
     shades: wp.array2d(dtype=Shade)
-    sent: wp.array2d(dtype=wp.vec3)
+    radiosity: wp.array2d(dtype=wp.vec3)
     columns: wp.array2d(dtype=wp.vec2)
-    hidden: wp.array2d(dtype=wp.float32)
+    tool_occlusion: wp.array2d(dtype=wp.float32)
 
 
 @wp.struct

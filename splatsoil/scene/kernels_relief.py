@@ -1,6 +1,6 @@
 # mypy: ignore-errors
 # (Warp reads the annotations of kernels as types of its own)
-"""Warp kernels that make a relief of particles and look at what is near it."""
+"""Warp kernels of the height map: density of particles, its level set, erosion."""
 
 import warp as wp
 

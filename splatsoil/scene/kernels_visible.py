@@ -1,6 +1,6 @@
 # mypy: ignore-errors
 # (Warp reads the annotations of kernels as types of its own)
-"""Warp kernels that make the Gaussians of one moment that can be seen: those that soil carries, and particles' own."""
+"""Warp kernels of the Gaussians of one moment: those bound to the soil, and one for each particle near its surface."""
 
 import warp as wp
 

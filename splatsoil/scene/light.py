@@ -1,15 +1,12 @@
-"""Sun and sky.
+"""Illumination by sun and sky.
 
-The colour carried by Gaussians is albedo, in units of the colour that level, open, sunlit soil shows: linear radiance
-is albedo times
+Gaussians carry albedo, in units of the colour of level, open, sunlit soil. Linear radiance is albedo times irradiance,
 
-    E = ambient · openness + (1 − ambient) · max(n·l, 0)/l_z · visible + bounced      (per channel)
+    E = ambient · V_sky + (1 − ambient) · max(n·l, 0)/l_z · V_sun + R      (per channel)
 
-with n the surface's normal, l the direction to the sun, openness the share of a uniform sky (weighted by the cosine)
-that soil and tool leave open, visible the share of the sun that they let through, and bounced the light that comes
-from the soil and the tool which stand in the sky's way. E is 1 on level ground, so the images' exposure and white
-balance stay inside the albedo, and a direction and an ambient share a channel describe the light. All of this is in
-linear colour, which sRGB images are turned into first: sums of light in sRGB would be wrong.
+with n the surface's normal and l the direction to the sun. V_sky is the visible share of a uniform sky, weighted by the
+cosine, V_sun the visible share of the sun, and R the interreflection from soil and tool. E is 1 on level ground, so
+that exposure and white balance are part of the albedo. All of this is in linear colour; sums in sRGB would be wrong.
 """
 
 from __future__ import annotations
@@ -30,13 +27,13 @@ from splatsoil.scene import kernels
 FloatArray = npt.NDArray[np.float64]
 
 SOIL_REFLECTANCE = 0.4
-"""Share of light that dry sand sends back (0.35 to 0.45 in the visible): how much trench walls light each other.
+"""Reflectance of dry sand (0.35 to 0.45 in the visible), for interreflection.
 
-Photographs without a calibration target do not tell it; the light it decides is a tenth of the whole in a deep trench.
+Photographs without a calibration target do not tell it; interreflection is a tenth of the irradiance in a deep trench.
 """
 
 _TOOL_LIGHT = 0.5
-"""Light on the side of the tool that a shaded point sees, in units of level ground's."""
+"""Irradiance on the side of the tool that a shaded point sees, over that of level ground."""
 
 
 @dataclass(frozen=True)
@@ -96,19 +93,19 @@ class Light:
         )
 
     def reflectance(self, colour: npt.ArrayLike) -> FloatArray:
-        """Share of light (3,) that a thing of a linear colour (in sun and sky, as ``level`` is) sends back."""
+        """Reflectance (3,) of a surface of a linear colour, seen in sun and sky as ``level`` is."""
         return SOIL_REFLECTANCE * np.asarray(colour, dtype=np.float64) / float(self.level.mean())
 
     def kernel_form(self, tool: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Any:
-        """The numbers as the kernels take them, with the tool's linear colour (3,)."""
+        """This in the kernels' form, with the tool's linear colour (3,)."""
         out = kernels.Illumination()
         out.sun, out.ambient = wp.vec3(*self.direction), wp.vec3(*self.ambient)
-        out.ground, out.side = wp.vec3(*self.reflectance(self.level)), wp.vec3(*self.tool_side(tool))
+        out.ground, out.side = wp.vec3(*self.reflectance(self.level)), wp.vec3(*self.tool_radiosity(tool))
         out.tool = wp.vec3(*np.asarray(tool, dtype=np.float64))
         return out
 
-    def tool_side(self, tool: npt.ArrayLike) -> FloatArray:
-        """Light (3,) that a shaded point sees on the side of a tool of this linear colour."""
+    def tool_radiosity(self, tool: npt.ArrayLike) -> FloatArray:
+        """Radiosity (3,) of the side of a tool of this linear colour that a shaded point sees."""
         return _TOOL_LIGHT * self.reflectance(tool)
 
 

@@ -1,13 +1,10 @@
-"""The light that explains how colours differ over a bed at rest, and what the tool's shadow changes.
+"""The sun's direction and the sky's share by a robust fit to differences of log brightness.
 
-Albedo varies from place to place and its blotches look like slopes; where a shadow ends, or a slope turns, brightness
-changes over millimetres while the albedo does not know of it. So differences of log brightness over a short distance
-are compared with those that a light predicts, with a robust loss: the tool's shadow, where there is one, gives the
-sun's direction by its edge and the sky's share by what is left inside it, and slopes add what they know. Photographs
-blur a shadow's edge, which would look like more sky: for the share, the edge itself is left out.
+Albedo varies slowly over the bed; shadows end, and slopes turn, within millimetres. So differences of log brightness
+over a short distance depend on the illumination. The edge of the tool's shadow gives the sun's direction, brightness
+within it the sky's share. Photographs blur that edge, which would look like more sky: for the share it is left out.
 
-Where the tool's shadow passes on over untouched soil, what a place loses and gains by it owes nothing to the albedo: a
-dark blotch in the shadow at rest would look like less sky, a pale one like more.
+Where the tool's shadow moves over undisturbed soil, the change of brightness does not depend on albedo at all.
 """
 
 from __future__ import annotations
@@ -24,8 +21,8 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from splatsoil.scene.light import SOIL_REFLECTANCE, Light, towards
-from splatsoil.scene.lit import facing, normals, open_sky, suns_on_points
 from splatsoil.scene.relief import Relief
+from splatsoil.scene.shading import normals, sky_visibility_of, sun_cosines, sun_visibility_at
 from splatsoil.splats.warp_torch import upload
 
 FloatArray = npt.NDArray[np.float64]
@@ -59,8 +56,8 @@ _LEAST_CHANGE = 0.01
 
 
 @dataclass(frozen=True)
-class Passing:
-    """The tool somewhere else, its shadow on soil that hasn't moved, as one camera sees it.
+class MovedShadow:
+    """Brightness of undisturbed soil under the tool's shadow at another time, as one camera sees it.
 
     Attributes:
         tool: its pose in the kernels' form.
@@ -79,9 +76,9 @@ def fit_light(
     tool: object,
     *,
     blur: int = 1,
-    passing: Sequence[Passing] = (),
+    moved_shadows: Sequence[MovedShadow] = (),
 ) -> Light:
-    """The light that explains the colours of a grid of points on a surface.
+    """The illumination that explains the colours of a grid of points on a surface.
 
     Args:
         points: (rows · columns, 3) points of a regular grid in x and y, row by row, m.
@@ -90,12 +87,12 @@ def fit_light(
         relief: the surface.
         tool: the tool's pose in the kernels' form.
         blur: half width of a shadow's edge in the photographs, in rows and columns.
-        passing: what the tool's shadow did elsewhere.
+        moved_shadows: of the tool, at other times.
     """
     thin = torch.zeros(shape, dtype=torch.bool, device=points.device)
     thin[::_THINNED, ::_THINNED] = True
     thin = thin.reshape(-1)
-    changes = [(p.tool, p.change[thin]) for p in passing if _known(p.change[thin]) >= _FEWEST_SHADED]
+    changes = [(p.tool, p.change[thin]) for p in moved_shadows if _known(p.change[thin]) >= _FEWEST_SHADED]
     problem = _Problem(_Bed(points, shape, relief, tool, thin), colours.clamp_min(1e-4).log(), changes)
     first = _start(problem)
     found = minimize(
@@ -144,7 +141,7 @@ class _Bed:
     def let_through(self, tool: object, directions: Directions, points: Tensor) -> Tensor:
         """(d, n) share of the sun that the tool, and soil that stands higher, let through to points."""
         suns = upload([towards(azimuth, elevation) for azimuth, elevation in directions], points.device)
-        return suns_on_points(self.relief, tool, suns, points, 0.25 * FINEST)
+        return sun_visibility_at(self.relief, tool, suns, points, 0.25 * FINEST)
 
     def edge(self, tool: object, at: tuple[float, float], width: int) -> tuple[Tensor, Tensor]:
         """(n,) points nearer to a shadow's edge than so many rows or columns, and those in full shadow."""
@@ -153,21 +150,23 @@ class _Bed:
         return (highest + lowest > 0.02).reshape(-1), (sun < 0.02).reshape(-1)
 
 
-class _Lights:
-    """Log of the light on points of a bed, 0 on level open ground, with the tool at one place."""
+class _LogIrradiance:
+    """Log of the irradiance on points of a bed, 0 on level open ground, with the tool at one pose."""
 
     def __init__(self, bed: _Bed, tool: object, points: Tensor) -> None:
         self.bed, self.tool, self.points, self.normal = bed, tool, points, normals(bed.relief, points)
-        self.openness, hidden = (bed.relief.sample(share, points) for share in open_sky(bed.relief, tool))
-        # Soil and tool in the sky's way have half of level ground's light.
-        self.returned = 0.5 * (SOIL_REFLECTANCE * (1.0 - self.openness - hidden) + _TOOL_REFLECTANCE * hidden)
+        maps = sky_visibility_of(bed.relief, tool)
+        self.sky_visibility, hidden = (bed.relief.sample(share, points) for share in maps)
+        # Soil and tool that hide the sky have half of level ground's irradiance.
+        hiding = SOIL_REFLECTANCE * (1.0 - self.sky_visibility - hidden) + _TOOL_REFLECTANCE * hidden
+        self.interreflection = 0.5 * hiding
 
     def of(self, directions: Directions, shares: Sequence[float] | FloatArray) -> Iterator[Tensor]:
         """(d, n) for suns from these directions, one share of the sky after the other."""
         suns = upload([towards(azimuth, elevation) for azimuth, elevation in directions], self.points.device)
-        sun = facing(suns, self.normal) * self.bed.let_through(self.tool, directions, self.points)
+        sun = sun_cosines(suns, self.normal) * self.bed.let_through(self.tool, directions, self.points)
         for share in shares:
-            yield (share * self.openness + (1.0 - share) * sun + self.returned).clamp_min(1e-3).log()
+            yield (share * self.sky_visibility + (1.0 - share) * sun + self.interreflection).clamp_min(1e-3).log()
 
 
 class _Problem:
@@ -175,10 +174,10 @@ class _Problem:
 
     def __init__(self, bed: _Bed, brightness: Tensor, changes: Sequence[tuple[object, Tensor]], lag: int = LAG) -> None:
         self.bed, self.brightness, self.changes, self.lag = bed, brightness, changes, lag
-        self.still = _Lights(bed, bed.tool, bed.points)
+        self.still = _LogIrradiance(bed, bed.tool, bed.points)
         # Cameras that look at the same moment share its light.
         tools = {id(tool): tool for tool, _ in changes}
-        self.later = {key: _Lights(bed, tool, bed.points[bed.thin].contiguous()) for key, tool in tools.items()}
+        self.later = {key: _LogIrradiance(bed, tool, bed.points[bed.thin].contiguous()) for key, tool in tools.items()}
         self.scale = _middle(self.differences(_channel(brightness, None)))
         self.scales = [max(_middle(_centred(_channel(change, None))), _LEAST_CHANGE) for _, change in changes]
         # A few places known of a moment must not weigh as much as all of the bed.

@@ -1,4 +1,4 @@
-"""The soil's surface under the light: heights over the bed, computed from particles.
+"""The soil's surface as a height map over the bed, computed from particles.
 
 Particles are spread on a grid with a smooth kernel whose standard deviation is their spacing; the surface is where the
 number density falls to half of its value inside the soil, taken from above. The kernel is even and the walls mirror it,

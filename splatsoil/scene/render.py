@@ -1,4 +1,4 @@
-"""What a camera sees of particles that carry Gaussians, under a light, with the tool among them."""
+"""Images of particles that carry Gaussians, under sun and sky, with the tool among them."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from torch import Tensor
 
 from splatsoil.batches import in_batches
 from splatsoil.measurement import Bed, Camera
-from splatsoil.scene import kernels_visible
-from splatsoil.scene.albedo import BRIGHTEST, SurfaceAlbedo, other_grain_albedo
+from splatsoil.scene import kernels, kernels_visible
+from splatsoil.scene.albedo import BRIGHTEST, SurfaceAlbedo, sampled_albedo
 from splatsoil.scene.binding import Binding, bind
 from splatsoil.scene.layers import Layers, Posed, layers_of
 from splatsoil.scene.light import Light, encoded, linear
-from splatsoil.scene.lit import light_relief
 from splatsoil.scene.relief import SMOOTHING, Relief, relief_of_particles
+from splatsoil.scene.shading import shade
 from splatsoil.scene.tool import ToolBody
 from splatsoil.splats import Gaussians
 from splatsoil.splats.steps import Steps, finished, together
@@ -132,13 +132,13 @@ class Scene:
         grains = encoded(self.surface_albedo.beneath(x, relief.depth_below(x)))
         return self.replace(soil=self.soil.to_particles(x, self.spacing), grain_albedo=grains)
 
-    def with_other_albedo(self, seed: int) -> Scene:
-        """The same soil, coloured otherwise beneath its surface, where photographs leave the colour open."""
+    def with_sampled_albedo(self, seed: int) -> Scene:
+        """The same soil with a random sample of the unknown albedo beneath its surface."""
         x, surface = self.soil.particles, self.surface_albedo
         relief = relief_of_particles(x, self.spacing, self.bed.lower, self.bed.upper)
-        others = other_grain_albedo(
+        others = sampled_albedo(
             x,
-            relief.depth_below(x) - self.spacing,  # photographs show the uppermost layer
+            relief.depth_below(x) - self.spacing,  # photographs show the top layer
             linear(self.grain_albedo),
             surface.above(x),
             surface.length,
@@ -177,7 +177,7 @@ class Scene:
         return near[: len(centres)], near[len(centres) :]
 
     def pose(self, positions: Any, deformations: Any, tool: Pose | None) -> Posed:
-        """Move, hide and light everything for one moment.
+        """Move, cull and shade everything for one moment.
 
         Args:
             positions: (p, 3) particles now, m (array or tensor).
@@ -187,7 +187,7 @@ class Scene:
         return finished(self._posing(positions, deformations, tool))
 
     def poses(self, moments: Iterable[tuple[Any, Any, Pose | None]]) -> list[Posed]:
-        """Everything moved, hidden and lit for several moments, by arguments of `pose`."""
+        """Everything moved, culled and shaded for several moments, by arguments of `pose`."""
         return in_batches(lambda some: together([self._posing(*m) for m in some]), list(moments), "moments")
 
     def _posing(self, positions: Any, deformations: Any, tool: Pose | None) -> Steps[Posed]:
@@ -198,7 +198,7 @@ class Scene:
             x, self.spacing, self.bed.lower, self.bed.upper, smoothing=self.smoothing
         )
         placed = self.tool.absent() if tool is None else self.tool.at(*tool)
-        lit = yield from light_relief.steps(relief, self.light, placed, self.tool_albedo)
+        shading = yield from shade.steps(relief, self.light, placed, self.tool_albedo)
         centres, covariances = self.soil.carry(x, None if f is None else f.contiguous())
         # Numbers of what is drawn, not masks: a GPU makes the host wait for each mask that selects something.
         chosen = yield from _numbers_of(self.shown(relief, centres, x))
@@ -217,13 +217,15 @@ class Scene:
             part.copy_(still)
         discs = (x.new_zeros((0, 3)), x.new_zeros((0, 3, 3))) if tool is None else self.tool.discs(*tool)
         centres, covariances, opacities, features = drawn
+        nearest = torch.empty_like(centres)
+        launch(kernels.nearest_of_tool, len(centres), [placed, *(as_warp(t, wp.vec3) for t in (centres, nearest))], x)
         own = slice(counts[0], counts[0] + counts[1])
-        return Posed(centres, covariances, opacities, features, own, chosen[1], discs, lit)
+        return Posed(centres, covariances, opacities, features, own, chosen[1], nearest, discs, shading)
 
     def recoloured(self, posed: Posed) -> Posed:
-        """What was posed of the same soil with other colours beneath its surface, in this scene's."""
+        """A posed scene of the same soil, its buried albedo replaced by this scene's."""
         features = posed.features.clone()
-        # Photographs show the sides' grains, and how they are lit is in what stands here.
+        # Photographs show the particles at the sides; their colours contain the irradiance.
         hidden = features[posed.grains, 3:] > 0.0
         features[posed.grains, :3] = torch.where(
             hidden, self.grain_albedo[posed.grain_numbers], features[posed.grains, :3]

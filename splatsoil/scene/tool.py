@@ -1,4 +1,4 @@
-"""The tool as rays and splats meet it."""
+"""The tool as a mesh for rays and as flat Gaussians."""
 
 from __future__ import annotations
 

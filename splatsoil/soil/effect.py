@@ -1,4 +1,4 @@
-"""The plug: what an effect is, and where it may act."""
+"""The interface of effects: parameters, and where an effect may act."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a friction angle and a cohesion to the Drucker-Prager cone sqrt(J2) <= k + a p (p positive in compression)."""
+"""The Drucker-Prager cone sqrt(J2) <= k + a p of a friction angle and a cohesion (p positive in compression)."""
 
 from __future__ import annotations
 

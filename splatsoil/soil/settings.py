@@ -1,4 +1,4 @@
-"""What one run of the soil model needs to know, before any effect and after all of them."""
+"""Settings of one simulation, which effects may change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gaussian splats: the set, its file, its picture and the picture's gradients, on CPU and CUDA."""
+"""Gaussian splatting: sets of Gaussians, their files, images and the images' gradients, on CPU and CUDA."""
 
 from splatsoil.splats.gaussians import Gaussians
 from splatsoil.splats.metrics import psnr, ssim, ssim_map

@@ -1,4 +1,4 @@
-"""Gaussians: what a splat model is made of, in metres and plain (not log or logit) values."""
+"""Sets of Gaussians, in metres and plain (not log or logit) values."""
 
 from __future__ import annotations
 

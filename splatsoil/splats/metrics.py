@@ -1,4 +1,4 @@
-"""How alike two pictures are: PSNR and SSIM, the latter fast and differentiable."""
+"""Image similarity: PSNR and a differentiable SSIM."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Drawing Gaussians: `rasterise` and `rasterise_features`, differentiable torch functions."""
+"""The rasteriser: `rasterise` and `rasterise_features`, differentiable torch functions."""
 
 from __future__ import annotations
 

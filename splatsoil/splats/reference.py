@@ -1,4 +1,4 @@
-"""The rasteriser once more, slow and obvious: plain torch, any float type, one Gaussian after another on all pixels.
+"""Reference rasteriser in plain torch, for any float type: one Gaussian after another on all pixels.
 
 It shares no code with the kernels but the constants and the camera, and gradients come from torch's autograd.
 """

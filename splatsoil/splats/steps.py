@@ -1,8 +1,7 @@
-"""Work that needs numbers of a GPU on the host, in steps, so that several pieces of it ask at once.
+"""Coroutines that share their synchronisations with a GPU.
 
-A GPU works on what it was told while the host goes on, until the host asks for a number (how many, how high): then the
-host waits, and where several processes share a GPU it waits for the turns of all. A piece of work that yields the
-tensors whose numbers it needs can be run beside others, and each round of questions is one.
+The host waits for the GPU whenever it reads a number from it. A generator that yields the tensors it must read runs
+beside others, and each round of reads is one synchronisation for all of them.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ Steps: TypeAlias = Generator[Tensor, list[float], T]
 
 
 class stepwise(Generic[P, T]):
-    """A function of steps as an ordinary one; others run ``.steps`` beside their own or within them."""
+    """A generator function as an ordinary one; ``.steps`` is the generator function."""
 
     def __init__(self, steps: Callable[P, Steps[T]]) -> None:
         self.steps = steps
@@ -38,7 +37,7 @@ def finished(steps: Steps[T]) -> T:
 
 
 def together(works: Sequence[Steps[T]]) -> list[T]:
-    """The results of several, on a GPU round by round; on a CPU, where numbers cost nothing, one after the other."""
+    """The results of several, on a GPU in rounds; on a CPU, where reads cost nothing, one after the other."""
     results: dict[int, T] = {}
     asked: dict[int, Tensor] = {}
 

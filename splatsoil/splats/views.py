@@ -1,4 +1,4 @@
-"""Several scenes at once, each as one camera sees it: on a GPU one sort serves all, and small ones leave it idle."""
+"""Images of several scenes in one batch, each by its own camera, with one sort for all."""
 
 from __future__ import annotations
 

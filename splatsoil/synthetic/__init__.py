@@ -1,4 +1,4 @@
-"""Synthetic worlds: our own solver moves the sand, a path tracer that shares nothing with the splats photographs it."""
+"""Synthetic experiments: the solver moves the sand; a path tracer, which shares nothing with the splats, draws it."""
 
 from splatsoil.synthetic.appearance import Appearance
 from splatsoil.synthetic.recording import Recorder, Renderer

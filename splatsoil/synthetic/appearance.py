@@ -1,4 +1,4 @@
-"""How a synthetic world looks: sun and sky, blotchy sand, bin, ground and tool, all drawn by a seed."""
+"""Random appearance of a synthetic experiment: sun and sky, albedo of sand, bin, ground and tool."""
 
 from __future__ import annotations
 

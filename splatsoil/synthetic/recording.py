@@ -1,4 +1,4 @@
-"""What is recorded of a simulated run: photographs and video, heights by a scanner above it, depths by its cameras."""
+"""Instruments of a synthetic experiment: photographs, video, height grids and depth maps."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Recorder:
     Attributes:
         setup: tool, bed and cameras.
         trajectory: particles at all frames of the video; without force where it has none of any frame.
-        look: sun, sky and colours.
+        appearance: sun, sky and colours.
         seed: of light paths and noise.
         device: Warp device name.
         observation: how the video cameras, their clock, their light and the drawn tool differ from what the set will
@@ -62,7 +62,7 @@ class Recorder:
 
     setup: Setup
     trajectory: Trajectory
-    look: Appearance
+    appearance: Appearance
     seed: int = 0
     device: str = "cpu"
     observation: Observation = field(default_factory=Observation)
@@ -74,7 +74,7 @@ class Recorder:
         """Views and video, the video's pictures by frame and then by camera."""
         setup = self.setup
         rest = self.trajectory.positions[self.trajectory.frames.index(0)].astype(np.float64)
-        colours = self.look.sand_albedo(rest, setup.bed)
+        colours = self.appearance.sand_albedo(rest, setup.bed)
         views: list[Picture] = []
         video: list[Picture] = []
         undisturbed = (setup.frames[0], Observation())
@@ -127,22 +127,22 @@ class Recorder:
 
     def stage(self, frame: int, seen: Observation, colours: FloatArray) -> Renderer:
         """Soil, tool, bin and ground of one frame of the video; particle albedo (n, 3), linear."""
-        look = replace(
-            self.look,
-            azimuth=self.look.azimuth + seen.sun_azimuth,
-            elevation=self.look.elevation + seen.sun_elevation,
-            sky_share=self.look.sky_share + seen.sky_share,
+        appearance = replace(
+            self.appearance,
+            azimuth=self.appearance.azimuth + seen.sun_azimuth,
+            elevation=self.appearance.elevation + seen.sun_elevation,
+            sky_share=self.appearance.sky_share + seen.sky_share,
         )
         soil, tool = self._bodies(frame, seen, colours)
         walls, ground = surroundings_of(self.setup)
-        colour = look.sand if self.setup.bed.container == OPEN else look.bin
+        colour = appearance.sand if self.setup.bed.container == OPEN else appearance.bin
         return self.renderer(
-            [soil, Body.flat(tool, look.tool), *(Body.flat(wall, colour, GRAIN) for wall in walls)],
-            look.light,
+            [soil, Body.flat(tool, appearance.tool), *(Body.flat(wall, colour, GRAIN) for wall in walls)],
+            appearance.light,
             ground=ground,
-            ground_colour=look.ground,
+            ground_colour=appearance.ground,
             ground_grain=GRAIN,
-            pattern=look.seed,
+            pattern=appearance.seed,
             device=self.device,
         )
 

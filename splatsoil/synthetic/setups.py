@@ -1,4 +1,4 @@
-"""What a synthetic experiment consists of: bed, surface, tool, motion and cameras."""
+"""Setups of synthetic experiments: bed, surface, tool, motion and cameras."""
 
 from __future__ import annotations
 

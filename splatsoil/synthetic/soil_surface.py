@@ -1,4 +1,4 @@
-"""From particles to the surface that a camera sees."""
+"""The soil's surface mesh from particles, for the path tracer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A stage of triangles, ground, sun and sky, and what cameras see of it.
+"""The path tracer's scene: triangles, ground, sun and sky.
 
 A path tracer that shares nothing with the splats: pictures drawn by what reconstructs them would hide its faults.
 """

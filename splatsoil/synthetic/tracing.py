@@ -1,4 +1,4 @@
-"""Warp kernel: light paths from a camera's pixels to triangles over an endless ground, under a sun and an even sky.
+"""Path-tracing kernel: triangles over an infinite ground, under a sun and a uniform sky.
 
 Radiance is counted in units in which an even sky of radiance A lights a level plane with A, so that a diffuse surface
 sends back albedo times what falls on it, without factors of pi.

@@ -1,4 +1,4 @@
-"""From a setup and parameters to a measurement set: simulate, photograph, write."""
+"""Synthetic measurement sets: simulate, photograph, write."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def make_set(out: str | Path, setup: Setup, recipe: Recipe, progress: Report = l
     observation = law.observation(parameters)
     settings = law.settings(base_settings(experiment), parameters)
     resolution = Resolution.derive(experiment, recipe.preset)
-    look = Appearance.drawn(seed)
+    appearance = Appearance.drawn(seed)
     if particle_seed is None:
         particle_seed = int(np.random.default_rng([seed, 3]).integers(2**16, 2**31))
     particles = fill(setup.surface, setup.bed, resolution.spacing, seed=particle_seed)
@@ -135,13 +135,13 @@ def make_set(out: str | Path, setup: Setup, recipe: Recipe, progress: Report = l
         "preset": recipe.preset if isinstance(recipe.preset, str) else recipe.preset.name,
         "resolution": asdict(resolution),
         "device": device,
-        "appearance": asdict(look),
+        "appearance": asdict(appearance),
         "sensor_noise": NOISE,
         **({"height_noise": GRID_NOISE} if recipe.heights else {}),
         **({"depth_noise": DEPTH_NOISE} if recipe.depth_maps else {}),
     }
     recorder = Recorder(
-        setup, trajectory, look, seed, device, observation, progress=lambda share: progress("pictures", share)
+        setup, trajectory, appearance, seed, device, observation, progress=lambda share: progress("pictures", share)
     )
     measurement = photograph_run(target, recorder, truth, heights=recipe.heights, depth_maps=recipe.depth_maps)
     seconds = {"simulation": simulated - began, "pictures": time.perf_counter() - simulated}

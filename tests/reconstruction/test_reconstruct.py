@@ -175,14 +175,14 @@ def alike(measurement, result, change=lambda images: images, bed=None):
 
 def test_likeness_is_of_the_soil_and_whatever_the_exposure(measurement, result):
     plain = alike(measurement, result)
-    assert plain.upright.min() > 0.8 > 0.4 > np.abs(plain.upside_down).max()
+    assert plain.correlation.min() > 0.8 > 0.4 > np.abs(plain.control).max()
     dimmed = alike(measurement, result, lambda images: 0.2 + 0.5 * images)
-    np.testing.assert_allclose(dimmed.upright, plain.upright, atol=1e-4)
+    np.testing.assert_allclose(dimmed.correlation, plain.correlation, atol=1e-4)
     grey = alike(measurement, result, lambda images: torch.full_like(images, 0.5))
-    assert np.isnan(grey.upright).all()
+    assert np.isnan(grey.correlation).all()
     away = replace(measurement.bed, lower=measurement.bed.lower + 50.0, upper=measurement.bed.upper + 50.0)
     none = alike(measurement, result, bed=away)
-    assert np.isnan(none.upright).all() and not none.unlike(2).any() and not none.unrelated(2).any()
+    assert np.isnan(none.correlation).all() and not none.unlike(2).any() and not none.unrelated(2).any()
 
 
 def test_a_wall_over_a_tenth_of_the_soil_leaves_a_picture_alike_and_a_shift_does_not(measurement, result):
@@ -191,8 +191,8 @@ def test_a_wall_over_a_tenth_of_the_soil_leaves_a_picture_alike_and_a_shift_does
         images[:, -images.shape[1] // 8 :] = 1.0
         return images
 
-    plain, hidden = alike(measurement, result).upright, alike(measurement, result, walled).upright
-    shifted = alike(measurement, result, lambda images: torch.roll(images, 8, dims=2)).upright
+    plain, hidden = alike(measurement, result).correlation, alike(measurement, result, walled).correlation
+    shifted = alike(measurement, result, lambda images: torch.roll(images, 8, dims=2)).correlation
     np.testing.assert_allclose(hidden, plain, atol=0.1)
     assert shifted.max() < hidden.min()
 
@@ -204,7 +204,7 @@ def test_less_alike_than_any_other_and_no_more_than_chance():
     found = Likeness(np.sqrt(np.append(views, fixed)), np.full(9, 0.25))
     assert found.unlike(4).tolist() == [False, True, True, False]
     assert found.unrelated(4).tolist() == [False, False, True, False]
-    found.upside_down[0] = 0.9  # a view itself is no more alike than that
+    found.control[0] = 0.9  # a view itself is no more alike than that
     assert not found.unrelated(4).any()
 
 

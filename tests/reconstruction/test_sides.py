@@ -12,7 +12,7 @@ from splatsoil.measurement import Contents, Measurement, Picture, write_measurem
 from splatsoil.reconstruction import reconstruct
 from splatsoil.reconstruction.presets import preset_named
 from splatsoil.reconstruction.sides import sides_seen
-from splatsoil.reconstruction.surface import find_relief
+from splatsoil.reconstruction.surface import find_geometry
 from splatsoil.reconstruction.views import load_views, silhouettes
 
 
@@ -59,8 +59,8 @@ def test_soil_at_the_sides_is_told_from_walls_and_fields(scene, glass, behind_gl
     for measurement in (behind_glass, field, walled):
         views = load_views(measurement.views, preset.longest_side)
         hidden = silhouettes(views, measurement.tool.placed(0.0))
-        relief = find_relief(views, measurement.bed, hidden, preset, lambda *_: None)
-        found.append(sides_seen(views, measurement.bed, relief))
+        geometry = find_geometry(views, measurement.bed, hidden, preset, lambda *_: None)
+        found.append(sides_seen(views, measurement.bed, geometry))
     assert found == [True, False, False]
 
 

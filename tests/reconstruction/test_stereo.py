@@ -12,7 +12,7 @@ from splatsoil.measurement import Camera
 from splatsoil.reconstruction import PRESETS, HeightField
 from splatsoil.reconstruction.initial import seed_far, seed_rim
 from splatsoil.reconstruction.stereo import Smoothness, visibility
-from splatsoil.reconstruction.surface import Relief, find_relief, with_rim, without_backdrop
+from splatsoil.reconstruction.surface import Geometry, find_geometry, with_rim, without_backdrop
 from splatsoil.reconstruction.views import Views, silhouettes
 
 
@@ -25,9 +25,9 @@ def photographed(scene, count: int) -> Views:
     return as_views(cameras, [scene.render(camera, seed=k) for k, camera in enumerate(cameras)])
 
 
-def relief_of(scene, views: Views) -> Relief:
+def geometry_of(scene, views: Views) -> Geometry:
     hidden = silhouettes(views, scene.tool().placed(0.0))
-    return find_relief(views, scene.bed, hidden, PRESETS["tiny"], lambda what, share: None)
+    return find_geometry(views, scene.bed, hidden, PRESETS["tiny"], lambda what, share: None)
 
 
 @pytest.fixture(scope="module")
@@ -36,23 +36,25 @@ def views(scene) -> Views:
 
 
 @pytest.fixture(scope="module")
-def relief(scene, views) -> Relief:
-    return relief_of(scene, views)
+def geometry(scene, views) -> Geometry:
+    return geometry_of(scene, views)
 
 
-def test_the_surface_is_found_to_a_fraction_of_a_pixel(scene, views, relief):
+def test_the_surface_is_found_to_a_fraction_of_a_pixel(scene, views, geometry):
     """A pixel is 8 mm on the bed here. The tool hides parts of it in every view, the walls in some."""
-    exact = scene.surface(relief.surface)
-    assert relief.surface.rmse(exact) < 2.5e-3
-    assert abs(relief.surface.bias(exact)) < 0.7e-3
+    exact = scene.surface(geometry.surface)
+    assert geometry.surface.rmse(exact) < 2.5e-3
+    assert abs(geometry.surface.bias(exact)) < 0.7e-3
     flat = replace(exact, height=np.full_like(exact.height, scene.level))
-    assert flat.rmse(exact) > 3 * relief.surface.rmse(exact)  # the check can fail: the waves are larger than the bound
+    assert flat.rmse(exact) > 3 * geometry.surface.rmse(
+        exact
+    )  # the check can fail: the waves are larger than the bound
 
 
-def test_the_ground_under_a_bin_and_around_a_field(scene, relief):
-    assert relief.ground == pytest.approx(float(scene.bed.lower[2]))
+def test_the_ground_under_a_bin_and_around_a_field(scene, geometry):
+    assert geometry.ground == pytest.approx(float(scene.bed.lower[2]))
     field = replace(scene, wall=0.0)
-    found = relief_of(field, photographed(field, 10))
+    found = geometry_of(field, photographed(field, 10))
     assert found.ground == pytest.approx(field.level, abs=0.5 * field.wave)
 
 
@@ -87,19 +89,19 @@ def test_a_wall_hides_what_lies_in_its_shadow():
     np.testing.assert_array_equal(visibility(views, beyond, ground, clearance=0.005)[0].numpy(), [1, 1])
 
 
-def test_the_rim_is_as_high_as_the_soil_beside_it(scene, relief):
-    rim = with_rim(relief.surface, scene.bed, 0.03)
+def test_the_rim_is_as_high_as_the_soil_beside_it(scene, geometry):
+    rim = with_rim(geometry.surface, scene.bed, 0.03)
     lower = scene.bed.lower
-    edge = relief.surface.sample(np.array([[lower[0], lower[1] + 0.2]]))
+    edge = geometry.surface.sample(np.array([[lower[0], lower[1] + 0.2]]))
     assert rim.sample(np.array([[lower[0] - 0.015, lower[1] + 0.2]])) == pytest.approx(edge, abs=5e-3)
     assert rim.height.min() < lower[2] - 1.0, "nothing beyond it hides anything"
 
 
-def test_discs_cover_the_border_around_the_bed(scene, relief):
+def test_discs_cover_the_border_around_the_bed(scene, geometry):
     """As many as fit on its top, on its outer side down to the ground, and on its inner one down to the soil; none
     leaves a gap."""
-    spacing, rim, lower, upper = 0.01, relief.rim, scene.bed.lower[:2], scene.bed.upper[:2]
-    seeds = seed_rim(relief, scene.bed, spacing)
+    spacing, rim, lower, upper = 0.01, geometry.rim, scene.bed.lower[:2], scene.bed.upper[:2]
+    seeds = seed_rim(geometry, scene.bed, spacing)
     flat = seeds.normals[:, 2] == 1.0
     top, side = seeds.points[flat], seeds.points[~flat]
     grid = np.random.default_rng(0).uniform(lower - rim, upper + rim, (2000, 2))
@@ -110,27 +112,27 @@ def test_discs_cover_the_border_around_the_bed(scene, relief):
     away = np.maximum(lower - side[:, :2], side[:, :2] - upper).max(axis=1)
     outer = np.isclose(away, rim)
     assert away[~outer] == pytest.approx(0.0, abs=1e-9)
-    height = top[:, 2].mean() - relief.ground
+    height = top[:, 2].mean() - geometry.ground
     assert outer.sum() * spacing**2 == pytest.approx(2.0 * (upper - lower + 2.0 * rim).sum() * height, rel=0.1)
-    high = replace(relief, wall=float(relief.surface.height.max()) + 0.1)
+    high = replace(geometry, wall=float(geometry.surface.height.max()) + 0.1)
     inner = seed_rim(high, scene.bed, spacing).points
     inner = inner[np.isclose(np.maximum(lower - inner[:, :2], inner[:, :2] - upper).max(axis=1), 0.0)]
-    edge = np.concatenate([relief.surface.height[[0, -1]].ravel(), relief.surface.height[:, [0, -1]].ravel()])
+    edge = np.concatenate([geometry.surface.height[[0, -1]].ravel(), geometry.surface.height[:, [0, -1]].ravel()])
     assert len(inner) * spacing**2 == pytest.approx(2.0 * (upper - lower).sum() * (high.wall - edge.mean()), rel=0.1)
 
 
-def test_first_discs_far_away_lie_on_the_ground_and_on_a_sphere_around_all_cameras(scene, relief):
+def test_first_discs_far_away_lie_on_the_ground_and_on_a_sphere_around_all_cameras(scene, geometry):
     """Six times as far from the bed as the farthest camera; nothing within the bed and its border."""
     cameras = scene.cameras(6, 64, 48, rise=(5.0, 40.0))
     views = as_views(cameras, [np.zeros((48, 64, 3), np.float32)] * 6)
-    seeds = seed_far(views, scene.bed, relief)
-    centre = np.array([*(scene.bed.lower + scene.bed.upper)[:2] / 2, relief.ground])
+    seeds = seed_far(views, scene.bed, geometry)
+    centre = np.array([*(scene.bed.lower + scene.bed.upper)[:2] / 2, geometry.ground])
     radius = 6.0 * max(np.linalg.norm(camera.position - centre) for camera in views.cameras)
     up = seeds.normals[:, 2] == 1.0
-    assert up.any() and not up.all() and np.allclose(seeds.points[up, 2], relief.ground)
+    assert up.any() and not up.all() and np.allclose(seeds.points[up, 2], geometry.ground)
     away = np.linalg.norm(seeds.points - centre, axis=1)
     assert (away[up] < radius).all() and away[~up] == pytest.approx(radius)
-    lower, upper = scene.bed.lower[:2] - relief.rim, scene.bed.upper[:2] + relief.rim
+    lower, upper = scene.bed.lower[:2] - geometry.rim, scene.bed.upper[:2] + geometry.rim
     assert not np.all((seeds.points[:, :2] > lower) & (seeds.points[:, :2] < upper), axis=1).any()
 
 

@@ -43,9 +43,9 @@ def test_the_walls_top_is_found_to_a_pixel(scene, rim):
     cameras = there.cameras(16, 128, 96)
     images = [there.render(camera, seed=k) for k, camera in enumerate(cameras)]
     views = Views.of(cameras, images, [np.ones(image.shape[:2], dtype=bool) for image in images], "x" * len(images))
-    trust = 1.0 - silhouettes(views, there.tool().placed(0.0))
+    usable = 1.0 - silhouettes(views, there.tool().placed(0.0))
     pixel = footprint(views, there.bed)
-    assert wall_top(views, there.bed, trust) == pytest.approx(there.level + rim, abs=1.2 * pixel)
+    assert wall_top(views, there.bed, usable) == pytest.approx(there.level + rim, abs=1.2 * pixel)
 
 
 def test_what_walls_hide_is_not_compared(walled, measurement, made):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 
-from splatsoil.scene.albedo import SurfaceAlbedo, other_grain_albedo
+from splatsoil.scene.albedo import SurfaceAlbedo, sampled_albedo
 
 LENGTH, CONTRAST = 0.03, 0.2
 
@@ -17,7 +17,7 @@ def guesses(points, depth, count=400):
     best = torch.full((len(points), 3), 0.3)
     grains = torch.tensor(points, dtype=torch.float32)
     parts = (grains, torch.full((len(points),), depth), best, torch.tensor(above, dtype=torch.float32), LENGTH)
-    found = [other_grain_albedo(*parts, np.random.default_rng(seed)) for seed in range(count)]
+    found = [sampled_albedo(*parts, np.random.default_rng(seed)) for seed in range(count)]
     return np.log(torch.stack(found)[..., 0].numpy() / 0.3)
 
 

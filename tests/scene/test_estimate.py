@@ -10,11 +10,11 @@ import trimesh
 from scipy.ndimage import gaussian_filter
 
 from splatsoil.measurement import Bed, Frame, Measurement, ToolMotion
-from splatsoil.scene import Light, Relief, ToolBody, estimate, estimate_light, light_relief
+from splatsoil.scene import Light, Relief, ToolBody, estimate, estimate_light, shade
 from splatsoil.scene.estimate import untouched
-from splatsoil.scene.light_fit import Passing, fit_light
-from splatsoil.scene.lit import suns_on_points
+from splatsoil.scene.light_fit import MovedShadow, fit_light
 from splatsoil.scene.relief import relief_of_particles
+from splatsoil.scene.shading import sun_visibility_at
 from splatsoil.synthetic import paper
 from splatsoil.synthetic.setups import staged_motion
 
@@ -33,7 +33,7 @@ def seen(azimuth, elevation, ambient, blur=0.0, size=(110, 160), plate=(0.4, 0.2
     blotches = gaussian_filter(generator.normal(size=(ny, nx)), 3.0)
     albedo = np.exp(0.12 * blotches / blotches.std())[..., None] * np.array([0.69, 0.55, 0.37])
     points = relief.points.reshape(-1, 3)
-    light = light_relief(relief, truth, place).irradiance(points, 0.001).numpy()
+    light = shade(relief, truth, place).irradiance(points, 0.001).numpy()
     shown = gaussian_filter(albedo * light.reshape(ny, nx, 3), (blur, blur, 0.0))
     noise = 1.0 + 0.01 * generator.normal(size=shown.shape)
     colours = torch.tensor((shown * noise).reshape(-1, 3), dtype=torch.float32)
@@ -78,11 +78,11 @@ def passed(truth, what, tool, plate, blur=0.0):
     """The change that the plate's shadow makes somewhere else, with noise of its own."""
     points, _, shape, relief, place = what
     there = tool.at(np.eye(3), plate)
-    lights = (light_relief(relief, truth, p).irradiance(points, 0.001).numpy() for p in (there, place))
+    lights = (shade(relief, truth, p).irradiance(points, 0.001).numpy() for p in (there, place))
     blurred = (gaussian_filter(light.reshape(*shape, 3), (blur, blur, 0.0)).reshape(-1, 3) for light in lights)
     then, rest = (torch.tensor(light) for light in blurred)
     noise = torch.tensor(0.01 * np.random.default_rng(7).normal(size=tuple(then.shape)), dtype=torch.float32)
-    return Passing(there, (then / rest).log() + noise)
+    return MovedShadow(there, (then / rest).log() + noise)
 
 
 @pytest.mark.parametrize(("azimuth", "elevation", "ambient"), AZIMUTHS)
@@ -90,26 +90,26 @@ def test_a_shadow_that_comes_later_tells_the_light(azimuth, elevation, ambient):
     # at rest the plate stands far away, and little but blotches is seen
     truth, what, tool = seen(azimuth, elevation, ambient, plate=(0.4, 5.0, 0.21))
     later = [passed(truth, what, tool, (x, 0.27, 0.19)) for x in (0.3, 0.4)]
-    found = fit_light(*what, passing=later)
+    found = fit_light(*what, moved_shadows=later)
     assert off(found, truth) < 2.0
     assert np.allclose(found.ambient, truth.ambient, atol=0.03)
     brighter = [replace(p, change=p.change + 0.05) for p in later]
-    assert np.allclose(fit_light(*what, passing=brighter).ambient, found.ambient, atol=1e-3)
+    assert np.allclose(fit_light(*what, moved_shadows=brighter).ambient, found.ambient, atol=1e-3)
     without = fit_light(*what)
     assert abs(without.ambient - truth.ambient).max() > 0.1
-    unknown = Passing(later[0].tool, torch.full_like(later[0].change, np.nan))
-    assert np.array_equal(fit_light(*what, passing=[unknown]).ambient, without.ambient)
+    unknown = MovedShadow(later[0].tool, torch.full_like(later[0].change, np.nan))
+    assert np.array_equal(fit_light(*what, moved_shadows=[unknown]).ambient, without.ambient)
 
 
 def test_a_passing_shadow_known_at_its_edge_only_hardly_counts():
     truth, what, tool = seen(145.0, 53.0, 0.6)
     later = passed(truth, what, tool, (0.25, 0.27, 0.21))
     sun = torch.tensor(truth.direction[None], dtype=torch.float32)
-    share = suns_on_points(what[3], later.tool, sun, what[0], 0.001)[0].numpy()
+    share = sun_visibility_at(what[3], later.tool, sun, what[0], 0.001)[0].numpy()
     rim = (share > 0.02) & (gaussian_filter(share.reshape(what[2]), 0.8).reshape(-1) < 0.98)
     later.change[~torch.tensor(rim)] = np.nan
     assert rim.sum() >= 30
-    assert np.allclose(fit_light(*what, passing=[later]).ambient, truth.ambient, atol=0.05)
+    assert np.allclose(fit_light(*what, moved_shadows=[later]).ambient, truth.ambient, atol=0.05)
 
 
 @pytest.fixture
@@ -212,10 +212,10 @@ def test_what_the_tool_may_have_moved_tells_nothing_of_the_light(monkeypatch: py
     monkeypatch.setattr(estimate, "seen_colours", grey)
     monkeypatch.setattr(estimate, "fit_light", lambda points, *_, **told: given.update(told, points=points))
     estimate_light(measurement, relief, body)
-    moved = torch.isnan(given["passing"][-1].change).all(dim=1)
+    moved = torch.isnan(given["moved_shadows"][-1].change).all(dim=1)
     assert torch.equal(moved, ~untouched(measurement, given["points"], relief, body, [20])[20])
     assert 0.01 < moved.float().mean() < 0.5
-    assert torch.isfinite(given["passing"][0].change).all()
+    assert torch.isfinite(given["moved_shadows"][0].change).all()
 
 
 def test_the_video_tells_the_light(monkeypatch: pytest.MonkeyPatch):
@@ -230,7 +230,7 @@ def test_the_video_tells_the_light(monkeypatch: pytest.MonkeyPatch):
         assert np.allclose(np.array(tool.position), way.pose(moment / 50.0)[1], atol=1e-6)
         names = {f.camera_name for f in frames}
         asked.append((moment, tuple(sorted(names))))
-        light = light_relief(relief, truth, tool).irradiance(where, 0.001)
+        light = shade(relief, truth, tool).irradiance(where, 0.001)
         spots = torch.tensor(np.resize(albedo, (len(where), 1)))
         drift = 1.0 + 0.02 * moment / 10 * (1.0 if names == {"left"} else -1.0)
         return (light * spots * drift).float(), torch.full((len(where),), 5)

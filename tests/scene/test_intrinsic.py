@@ -46,7 +46,7 @@ def experiment(small_set: Path):
 def pictures(model: Model) -> list[bytes]:
     """Of soil at rest, with particles of two seeds and buried soil of another colour."""
     scene, drawn = model.scene(0), []
-    for each in (scene, model.scene(1), scene.with_other_albedo(2)):
+    for each in (scene, model.scene(1), scene.with_sampled_albedo(2)):
         posed = each.pose(each.soil.particles, None, model.measurement.tool.motion.pose(0.0))
         drawn += [each.picture(posed, camera.undistorted()).tobytes() for camera in model.measurement.cameras.values()]
     return drawn

@@ -1,6 +1,7 @@
 """Pictures of small scenes against what geometry says, and true particles against real frames."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,8 +23,8 @@ from splatsoil.scene import (
     build_scene,
     encoded,
     kernels,
+    kernels_horizon,
     kernels_relief,
-    kernels_sky,
     kernels_visible,
     linear,
     relief_of_particles,
@@ -117,6 +118,39 @@ def test_tool_hides_soil_and_soil_hides_tool(scene_of):
         assert (colour[2] > colour[0]) == shows
 
 
+@pytest.mark.parametrize(("opacity", "shows"), [(0.1, True), (0.4, True), (0.6, False), (0.9, False)])
+def test_half_of_the_light_decides_what_is_seen_of_a_tool_behind_a_veil(scene_of, opacity, shows):
+    """A plate that soil stands against from behind; the veil is far before it, so that the mean depth is, too."""
+    bed, view = level_bed(), camera()
+    behind = bed[bed[:, 1] > 0.21] + torch.tensor([0.0, 0.0, 0.1])
+    scene = scene_of(torch.cat([bed, behind]), mesh=trimesh.creation.box((0.3, 0.004, 0.14)))
+    posed = scene.pose(scene.soil.particles, None, (np.eye(3), np.array([0.2, 0.2, 0.15])))
+    point = np.array([0.2, 0.198, 0.17])
+    veil = torch.tensor(0.5 * (point + view.position), dtype=torch.float32)[None]
+    posed = replace(
+        posed,
+        centres=torch.cat([posed.centres, veil]),
+        covariances=torch.cat([posed.covariances, 0.01 * torch.eye(3)[None]]),
+        opacities=torch.cat([posed.opacities, torch.tensor([opacity])]),
+        features=torch.cat([posed.features, torch.tensor([[1.0, 0.0, 0.0, 0.0]])]),
+        nearest=torch.cat([posed.nearest, torch.tensor(point, dtype=torch.float32)[None]]),
+    )
+    share = scene.layers(posed, view).tool[..., 3][pixel(view, point)]
+    assert float(share) == float(shows)
+
+
+def test_what_lies_before_a_tool_is_told_by_its_nearest_point(scene_of):
+    """Of a plate larger than the distance to it: on either side, and past its edges."""
+    scene = scene_of(level_bed(), mesh=trimesh.creation.box((0.3, 0.004, 0.14)))
+    posed = scene.pose(scene.soil.particles, None, (np.eye(3), np.array([0.2, 0.2, 0.15])))
+    low, high = np.array([0.05, 0.198, 0.08]), np.array([0.35, 0.202, 0.22])
+    exact = np.clip(posed.centres.numpy(), low, high)
+    near = np.linalg.norm(posed.centres.numpy() - [0.2, 0.2, 0.15], axis=1) < 0.5 * np.linalg.norm(high - low)
+    outside = near & (np.linalg.norm(exact - posed.centres.numpy(), axis=1) > 1e-6)
+    assert outside.sum() > 100
+    assert np.allclose(posed.nearest.numpy()[outside], exact[outside], atol=1e-5)
+
+
 def test_background_is_seen_past_the_bed(scene_of):
     bed, view = level_bed(), camera()
     scene = scene_of(bed).replace(background=np.array([0.2, 0.3, 0.4]))
@@ -144,7 +178,7 @@ def test_other_particles_carry_the_same_picture(scene_of):
 
 def test_kernels_compile_for_cuda(tmp_path):
     """NVRTC comes with Warp, so a compiler error shows without a GPU; sm_90 is an H100 or H200."""
-    for module in (kernels, kernels_relief, kernels_sky, kernels_visible):
+    for module in (kernels, kernels_relief, kernels_horizon, kernels_visible):
         (artifact,) = wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
         assert ".entry" in Path(artifact).read_text()
 

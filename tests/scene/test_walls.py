@@ -106,6 +106,6 @@ def test_a_tool_takes_sky_from_a_wall(both):
     plate = trimesh.creation.box((0.3, 0.12, 0.01), trimesh.transformations.translation_matrix((0.2, 0.24, 0.22)))
     wall = np.s_[42:54, 60:100]
     drawn, traced = (image[wall].mean() for image in both(pit(0.1, 0.32), view, 0.0, plate, sky=0.999))
-    open_sky = both(pit(0.1, 0.32), view, 0.0, sky=0.999)[0][wall].mean()
-    assert traced < 0.8 * open_sky
+    sky_visibility_of = both(pit(0.1, 0.32), view, 0.0, sky=0.999)[0][wall].mean()
+    assert traced < 0.8 * sky_visibility_of
     assert drawn == pytest.approx(traced, rel=0.15)

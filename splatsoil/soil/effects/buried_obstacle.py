@@ -1,4 +1,4 @@
-"""Buried obstacle: a stone that nobody sees."""
+"""Buried obstacle: a fixed stone beneath the surface."""
 
 from __future__ import annotations
 

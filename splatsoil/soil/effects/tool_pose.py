@@ -1,4 +1,4 @@
-"""Tool pose: the tool is seen beside the place where the motion has it."""
+"""Tool pose: the tool is seen at an offset from its recorded motion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What of sun and sky reaches a surface: shadows of soil and tool, open sky, and light they send back."""
+"""Shading of a surface by sun and sky: visibility of both, and interreflection between soil and tool."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import torch.nn.functional as functional
 import warp as wp
 from torch import Tensor
 
-from splatsoil.scene import kernels, kernels_sky
+from splatsoil.scene import kernels, kernels_horizon
 from splatsoil.scene.kernels_maps import Maps, Shade, ToolPose
 from splatsoil.scene.light import Light
 from splatsoil.scene.relief import Relief
@@ -24,7 +24,7 @@ from splatsoil.splats.warp_torch import as_warp, launch, upload
 FloatArray = npt.NDArray[np.float64]
 
 _COARSE = 2
-"""Cells between which light is sent back and forth, in cells of the relief."""
+"""Cells of the interreflection, in cells of the relief."""
 
 
 _REACH = 1.0
@@ -32,51 +32,50 @@ _REACH = 1.0
 
 
 @dataclass(frozen=True)
-class LitRelief:
-    """A surface under a light.
+class Shading:
+    """Shading maps of a surface under sun and sky.
 
     Attributes:
         relief: the surface.
         light: the light.
         tool: the tool's pose in the kernels' form; it must not outlive its ToolBody.
-        openness: (ny, nx) share of the sky that each cell sees.
-        visible: (ny, nx) share of the sun that the soil lets through to each cell (the tool's shadow is not in it).
-        bounced: (ny, nx, 3) light from soil and tool that stand in the sky's way.
-        sent: (ny, nx, 3) light that each cell sends back.
-        hidden: (ny, nx) share of the sky that the tool takes from each cell.
+        sky_visibility: (ny, nx) share of the sky that each cell sees, weighted by the cosine.
+        sun_visibility: (ny, nx) share of the sun that each cell sees past the soil, without the tool's shadow.
+        interreflection: (ny, nx, 3) irradiance from soil and tool that hide the sky.
+        radiosity: (ny, nx, 3) of each cell.
+        tool_occlusion: (ny, nx) share of the sky that the tool hides from each cell.
     """
 
     relief: Relief
     light: Light
     tool: Any
-    openness: Tensor
-    visible: Tensor
-    bounced: Tensor
-    sent: Tensor
-    hidden: Tensor
+    sky_visibility: Tensor
+    sun_visibility: Tensor
+    interreflection: Tensor
+    radiosity: Tensor
+    tool_occlusion: Tensor
 
     @cached_property
     def maps(self) -> Any:
-        """What a picture is lit by, in the kernels' form."""
-        scalars = self.openness[..., None], self.visible[..., None]
+        """The maps in the kernels' form."""
+        scalars = self.sky_visibility[..., None], self.sun_visibility[..., None]
         out = Maps()
-        shades = torch.cat([self.relief.normal, *scalars, self.bounced], dim=2)
+        shades = torch.cat([self.relief.normal, *scalars, self.interreflection], dim=2)
         out.shades = wp.from_torch(shades, dtype=Shade)
-        out.sent, out.hidden = wp.from_torch(self.sent, dtype=wp.vec3), wp.from_torch(self.hidden)
+        out.radiosity = wp.from_torch(self.radiosity, dtype=wp.vec3)
+        out.tool_occlusion = wp.from_torch(self.tool_occlusion)
         return out
 
     def irradiance(self, points: Tensor, spread: float = 0.0) -> Tensor:
-        """Light (n, 3) on points (n, 3) of the surface; a point stands for a patch of half width ``spread`` metres."""
-        sky = self.relief.sample(self.openness, points)
+        """Irradiance (n, 3) at points (n, 3) of the surface, each a patch of half width ``spread`` metres."""
+        sky = self.relief.sample(self.sky_visibility, points)
         direct = direct_light(self.relief, self.light, self.tool, points, spread)
-        return _mixed(self.light, sky, direct) + self.relief.sample(self.bounced, points)
+        return _mixed(self.light, sky, direct) + self.relief.sample(self.interreflection, points)
 
 
 @stepwise
-def light_relief(
-    relief: Relief, light: Light, tool: Any, tool_colour: npt.ArrayLike = (0.0, 0.0, 0.0)
-) -> Steps[LitRelief]:
-    """Work out what of sky and sun reaches each cell of a surface.
+def shade(relief: Relief, light: Light, tool: Any, tool_colour: npt.ArrayLike = (0.0, 0.0, 0.0)) -> Steps[Shading]:
+    """Shade each cell of a surface.
 
     Args:
         relief: the surface.
@@ -88,34 +87,35 @@ def light_relief(
     visible = torch.empty_like(relief.height)
     inputs = [relief.surface, light.kernel_form(), as_warp(visible, wp.float32)]
     launch(kernels.sun_visibility, tuple(visible.shape), inputs, visible)
-    openness, hidden = open_sky(relief, tool)
-    ground, side = (upload(v, relief.device) for v in (light.reflectance(light.level), light.tool_side(tool_colour)))
+    sky_visibility, tool_occlusion = sky_visibility_of(relief, tool)
+    reflected = light.reflectance(light.level), light.tool_radiosity(tool_colour)
+    ground, side = (upload(v, relief.device) for v in reflected)
     rough = yield from _coarser(relief).ranged()
-    sky, tools = (_resized(m[None], rough.height.shape)[0] for m in (openness, hidden))
+    sky, tools = (_resized(m[None], rough.height.shape)[0] for m in (sky_visibility, tool_occlusion))
     direct = direct_light(relief, light, tool, rough.points.reshape(-1, 3), 0.5 * rough.cell[0])
     first = _mixed(light, sky.reshape(-1), direct).reshape(rough.normal.shape)
     by_tool = tools[..., None] * side
-    once = _look_around(rough, ground * (first + by_tool), ToolPose())[0]
-    # It goes on between slopes as within a sphere, each place of which sees the same share of the others.
+    once = _scan(rough, ground * (first + by_tool), ToolPose())[0]
+    # Further bounces as within a sphere, each point of which sees the same share of the others.
     by_soil = once / (1.0 - ground * (1.0 - sky - tools)[..., None])
     maps = torch.cat([by_soil, ground * (first + by_soil + by_tool)], dim=-1).permute(2, 0, 1)
     fine = _resized(maps, relief.height.shape).permute(1, 2, 0)
-    bounced, sent = fine[..., :3] + hidden[..., None] * side, fine[..., 3:].contiguous()
-    return LitRelief(relief, light, tool, openness, visible, bounced, sent, hidden)
+    interreflection, radiosity = fine[..., :3] + tool_occlusion[..., None] * side, fine[..., 3:].contiguous()
+    return Shading(relief, light, tool, sky_visibility, visible, interreflection, radiosity, tool_occlusion)
 
 
-def open_sky(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:
+def sky_visibility_of(relief: Relief, tool: Any) -> tuple[Tensor, Tensor]:
     """Shares (ny, nx) of the sky's light, weighted by the cosine, that soil and tool leave open to each cell (1 on an
     open plane), and that the tool alone takes."""
-    return _look_around(relief, None, tool)[1:]
+    return _scan(relief, None, tool)[1:]
 
 
-def _look_around(relief: Relief, sent: Tensor | None, tool: Any) -> tuple[Tensor, Tensor, Tensor]:
+def _scan(relief: Relief, radiosity: Tensor | None, tool: Any) -> tuple[Tensor, Tensor, Tensor]:
     """What each cell sees around it, by the horizon in a dozen directions.
 
     Args:
         relief: the surface.
-        sent: (ny, nx, 3) light sent back by each cell, the same in all directions; None for none.
+        radiosity: (ny, nx, 3) of each cell, the same in all directions; None for none.
         tool: a pose from `ToolBody.at` or `ToolBody.absent`.
 
     Returns:
@@ -124,14 +124,14 @@ def _look_around(relief: Relief, sent: Tensor | None, tool: Any) -> tuple[Tensor
     """
     like, maps = relief.normal, Maps()
     light, sky = torch.empty_like(like), like.new_empty((*like.shape[:2], 2))
-    if sent is not None:
-        maps.sent = wp.from_torch(sent, dtype=wp.vec3)
+    if radiosity is not None:
+        maps.radiosity = wp.from_torch(radiosity, dtype=wp.vec3)
     if tool.mesh:
         maps.columns = wp.from_torch(_tool_columns(relief, tool), dtype=wp.vec2)
     inputs = [relief.surface, maps, tool, as_warp(light, wp.vec3), as_warp(sky, wp.vec2)]
-    launch(kernels_sky.cells_look_around, tuple(relief.height.shape), inputs, like)
-    openness, hidden = sky.unbind(dim=-1)
-    return light, openness - hidden, hidden.contiguous()
+    launch(kernels_horizon.scan_cells, tuple(relief.height.shape), inputs, like)
+    sky_visibility, tool_occlusion = sky.unbind(dim=-1)
+    return light, sky_visibility - tool_occlusion, tool_occlusion.contiguous()
 
 
 def _tool_columns(relief: Relief, tool: Any) -> Tensor:
@@ -153,8 +153,8 @@ def _mixed(light: Light, sky: Tensor, direct: Tensor) -> Tensor:
 def direct_light(relief: Relief, light: Light, tool: Any, points: Tensor, spread: float = 0.0) -> Tensor:
     """The sun on points (n, 3) of the surface, (n,); 1 on level, open ground."""
     sun = upload(light.direction[None], relief.device)
-    visible = suns_on_points(relief, tool, sun, points, spread)
-    return (facing(sun, normals(relief, points)) * visible)[0]
+    visible = sun_visibility_at(relief, tool, sun, points, spread)
+    return (sun_cosines(sun, normals(relief, points)) * visible)[0]
 
 
 def normals(relief: Relief, points: Tensor) -> Tensor:
@@ -162,17 +162,17 @@ def normals(relief: Relief, points: Tensor) -> Tensor:
     return functional.normalize(relief.sample(relief.normal, points), dim=1)
 
 
-def facing(suns: Tensor, normal: Tensor) -> Tensor:
+def sun_cosines(suns: Tensor, normal: Tensor) -> Tensor:
     """Suns (k, 3) on open ground of normals (n, 3): (k, n), 1 where it is level."""
     return (suns @ normal.T).clamp_min(0.0) / suns[:, 2:]
 
 
-def suns_on_points(relief: Relief, tool: Any, suns: Tensor, points: Tensor, spread: float) -> Tensor:
+def sun_visibility_at(relief: Relief, tool: Any, suns: Tensor, points: Tensor, spread: float) -> Tensor:
     """Share (k, n) of suns (k, 3) that soil and tool let through to points (n, 3) on the surface, each of which stands
     for a patch of half width ``spread`` metres."""
     visible = torch.empty((len(suns), len(points)), dtype=torch.float32, device=points.device)
     inputs = [as_warp(points, wp.vec3), float(spread), relief.surface, as_warp(suns, wp.vec3), tool]
-    launch(kernels.suns_on_points, tuple(visible.shape), [*inputs, as_warp(visible, wp.float32)], visible)
+    launch(kernels.sun_visibility_at, tuple(visible.shape), [*inputs, as_warp(visible, wp.float32)], visible)
     return visible
 
 

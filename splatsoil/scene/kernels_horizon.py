@@ -1,6 +1,6 @@
 # mypy: ignore-errors
 # (Warp reads the annotations of kernels as types of its own)
-"""What a place sees around it: sky, soil that sends light back, and the tool."""
+"""Warp kernels of the hemisphere over a place: visible sky, radiosity of the soil around, and the tool."""
 
 # ruff: noqa: UP018 - Warp takes a bare literal for a constant, so what a loop changes starts as float(...)
 
@@ -18,8 +18,8 @@ _TURN = 2.0 * math.pi / AZIMUTHS
 
 
 @wp.struct
-class Around:
-    """Light from the soil around, and the shares of the sky that the soil leaves open and that the tool takes of it."""
+class Hemisphere:
+    """Irradiance from the soil around, and the shares of the sky that the soil leaves open and that the tool hides."""
 
     light: wp.vec3
     sky: float
@@ -43,22 +43,22 @@ def _cell(values: wp.array2d(dtype=Any), u: float, v: float):
 
 
 @wp.func
-def look_around(
+def scan_horizon(
     surface: Surface,
     maps: Maps,
     tool: ToolPose,
     place: wp.vec3,
     normal: wp.vec3,
-) -> Around:
-    """What a place of a unit normal sees, by its horizon in a dozen directions, in steps each a fifth longer than the
-    last (horizon-based indirect light, after Bavoil and Sainz, 2009).
+) -> Hemisphere:
+    """The hemisphere over a place of a unit normal, by its horizon in a dozen directions, in steps each a fifth longer
+    than the last (horizon-based indirect light, after Bavoil and Sainz, 2009).
 
-    Of the soil's light where maps tell what cells send back, of the tool where they tell what stands over them.
+    Irradiance from the soil needs a map of radiosity, the tool one of its columns.
     """
-    out = Around()
+    out = Hemisphere()
     u = (place[0] - surface.grid.x0) * surface.grid.inverse_x + 0.5
     v = (place[1] - surface.grid.y0) * surface.grid.inverse_y + 0.5
-    known = maps.sent.shape[0] > 0
+    known = maps.radiosity.shape[0] > 0
     up = wp.max(normal[2], 0.05)  # slopes are finite
     ahead = tool.centre - place
     radius = tool.radius + 2.0 * surface.step  # a cell around it may lie in its column
@@ -76,21 +76,21 @@ def look_around(
             step = float(surface.step)
             r = float(step)
             while r < surface.reach:
-                if step > surface.step:  # what lies between two cells is nothing to a look over several
+                if step > surface.step:  # what lies between two cells is nothing to a step over several
                     top = _cell(surface.height, u + r * c * surface.grid.inverse_x, v + r * s * surface.grid.inverse_y)
                 else:
                     top = height_at(surface, place[0] + r * c, place[1] + r * s)
                 climb = top - below
-                # A wall between two looks stands midway on the average.
+                # A wall between two samples stands midway on the average.
                 rise = (top - place[2]) / wp.where(climb > step, r - 0.5 * step, r)
                 if known and rise > slope:
                     upto = _wedge(rise, up, along)
-                    # Soil between two looks sends their mean; but a wall has none of the light on its top.
+                    # Soil between two samples has their mean radiosity; but a wall has none of that on its top.
                     upper = wp.where(climb <= step, 0.5, wp.max(1.0 - 0.5 * climb / step, 0.0))
                     before = _cell(
-                        maps.sent, u + last * c * surface.grid.inverse_x, v + last * s * surface.grid.inverse_y
+                        maps.radiosity, u + last * c * surface.grid.inverse_x, v + last * s * surface.grid.inverse_y
                     )
-                    here = _cell(maps.sent, u + r * c * surface.grid.inverse_x, v + r * s * surface.grid.inverse_y)
+                    here = _cell(maps.radiosity, u + r * c * surface.grid.inverse_x, v + r * s * surface.grid.inverse_y)
                     out.light += (upto - seen) * (before + upper * (here - before))
                     seen = upto
                 slope = wp.max(slope, rise)
@@ -123,15 +123,15 @@ def look_around(
 
 
 @wp.kernel(enable_backward=False)
-def cells_look_around(
+def scan_cells(
     surface: Surface,
     maps: Maps,
     tool: ToolPose,
     light: wp.array2d(dtype=wp.vec3),
     sky: wp.array2d(dtype=wp.vec2),
 ) -> None:
-    """`look_around` of each cell: light, and the shares of the sky that soil leaves open and that the tool takes."""
+    """`scan_horizon` of each cell: irradiance, and the shares of the sky that soil leaves open and the tool hides."""
     i, j = wp.tid()
-    seen = look_around(surface, maps, tool, cell_centre(surface, i, j), surface.normal[i, j])
+    seen = scan_horizon(surface, maps, tool, cell_centre(surface, i, j), surface.normal[i, j])
     light[i, j] = seen.light
     sky[i, j] = wp.vec2(seen.sky, seen.tool)
