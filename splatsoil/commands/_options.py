@@ -24,7 +24,7 @@ Preset = Literal["tiny", "small", "paper", "fine"]
 
 #: Texts of common options.
 SET = "Folder of the measurement set."
-PRESET = "Resolution; small suits a laptop without a graphics card."
+PRESET = "Resolution; tiny only tries the commands, small suits a laptop."
 DEVICE = "Where to compute: auto, cpu, cuda:0, …"
 SEED = "Of random numbers; one seed gives one result on one processor."
 BUDGET = "Evaluations; 10 for each free parameter if not given."
@@ -198,7 +198,7 @@ def _settings(hint: Any, metavar: str) -> dict[str, Any]:
 
 def program_page(configs: Mapping[str, type], description: str) -> str:
     """The help page with all commands."""
-    lines = ["usage: splatsoil COMMAND …", "", description, "Start with: splatsoil run examples/plow-dry --preset tiny"]
+    lines = ["usage: splatsoil COMMAND …", "", description, "Start with: splatsoil run examples/plow-dry"]
     left = dict(configs)
     for title, names in (*ORDER.items(), ("others", tuple(configs))):
         mine = [name for name in names if name in left]
