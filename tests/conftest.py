@@ -188,7 +188,7 @@ def over_level_soil() -> Callable[..., Any]:
 
     def make(measurement: Any, height: float, *effects: str) -> Model:
         surface = HeightField.over(measurement.bed.lower, measurement.bed.upper, 0.02, height)
-        seen = SimpleNamespace(surface=surface, soil=np.ones(1, dtype=bool))
+        seen = SimpleNamespace(surface=surface, soil=np.ones(1, dtype=bool), standing=None)
         return Model(measurement, seen, effects=effects, preset="tiny")  # type: ignore[arg-type]
 
     return make

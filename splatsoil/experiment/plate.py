@@ -16,7 +16,7 @@ from splatsoil.experiment.forces import SCALE, compressed
 from splatsoil.experiment.laboratory import LaboratoryExperiment
 from splatsoil.experiment.plow import FINER_RESOLUTIONS
 from splatsoil.measurement import Bed, Measurement, Tool, ToolMotion
-from splatsoil.mpm import PRESETS, Preset, Resolution, simulate
+from splatsoil.mpm import PRESETS, Resolution, simulate
 from splatsoil.reconstruction import HeightField, fill
 from splatsoil.soil.effect import Effect
 
@@ -113,7 +113,9 @@ class PlateExperiment(LaboratoryExperiment):
             ("force",),
             "plate",
         )
-        chosen = _finer(preset)
+        if preset not in PRESETS:
+            raise ParameterError(f"preset {preset!r} is unknown; known are {', '.join(PRESETS)}")
+        chosen = replace(PRESETS[preset], cells_across_tool=FINER * PRESETS[preset].cells_across_tool)
         resolution = Resolution.derive(self.set_up(), chosen)
         pressure = self._largest / (0.25 * np.pi * test.diameter**2)
         stiffer = max(RIGID * pressure / chosen.young, 1.0)
@@ -186,17 +188,6 @@ class PlateExperiment(LaboratoryExperiment):
             views=(),
             video=(),
         )
-
-
-def _finer(name: str) -> Preset:
-    """A preset with the cells of a plate.
-
-    Raises:
-        ParameterError: it is unknown.
-    """
-    if name not in PRESETS:
-        raise ParameterError(f"preset {name!r} is unknown; known are {', '.join(PRESETS)}")
-    return replace(PRESETS[name], cells_across_tool=FINER * PRESETS[name].cells_across_tool)
 
 
 def _surface_of(bed: Bed) -> float:
