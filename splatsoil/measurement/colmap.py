@@ -101,7 +101,7 @@ def _lines(file: Path) -> list[str]:
     return [line.strip() for line in read_text(file).splitlines() if not line.startswith("#")]
 
 
-def _numbers(words: Sequence[str], file: Path, field: str, kind: Callable[[str], Number] = float) -> tuple[Number, ...]:
+def _numbers(words: Sequence[str], file: Path, field: str, kind: Callable[[str], Number]) -> tuple[Number, ...]:
     try:
         return tuple(kind(word) for word in words)
     except ValueError as error:
@@ -116,7 +116,7 @@ def _read_cameras_txt(file: Path) -> dict[int, _Calibration]:
         if len(words) < 5:
             raise MeasurementError("expected CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", file=file, field=line[:40])
         identity, width, height = _numbers([words[0], *words[2:4]], file, line[:40], int)
-        out[identity] = words[1], width, height, _numbers(words[4:], file, f"camera {identity}, PARAMS")
+        out[identity] = words[1], width, height, _numbers(words[4:], file, f"camera {identity}, PARAMS", float)
     return out
 
 
@@ -131,7 +131,10 @@ def _read_images_txt(file: Path) -> list[_Pose]:
             raise MeasurementError(
                 "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", file=file, field=line[:40]
             )
-        values, (camera,) = np.array(_numbers(words[1:8], file, words[9])), _numbers(words[8:9], file, words[9], int)
+        values, (camera,) = (
+            np.array(_numbers(words[1:8], file, words[9], float)),
+            _numbers(words[8:9], file, words[9], int),
+        )
         out.append((camera, words[9], values[:4], values[4:]))
     return out
 
