@@ -26,6 +26,7 @@ from splatsoil.batches import full_memory
 from splatsoil.commands._options import parse, program_page, same_again
 from splatsoil.commands._output import only_json, print_json
 from splatsoil.errors import NoAnswer, SetWarning, SplatsoilError, did_you_mean
+from splatsoil.files import check_paths
 from splatsoil.trust import trust
 
 DESCRIPTION = "Soil properties from photographs of a tool moving through it."
@@ -94,6 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with only_json() if wants_json else nullcontext(), _printing_remarks():
         places: dict[str, str] = {}
         try:
+            check_paths(vars(config).values())
             return command.run(config)
         except NoAnswer as error:  # a result
             message, code, places = str(error), error.code, error.places

@@ -16,6 +16,11 @@ class SplatsoilError(Exception):
 
     code = 2
 
+    def __str__(self) -> str:
+        """The message, with escapes for characters that could act on a terminal, or that it cannot show."""
+        message = super().__str__()
+        return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in message)
+
 
 class MeasurementError(SplatsoilError):
     """A measurement set breaks its contract.

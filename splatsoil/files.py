@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import json
@@ -18,7 +19,7 @@ from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 
-from splatsoil.errors import RunError
+from splatsoil.errors import ParameterError, RunError
 
 #: Most bytes that an archive of a set or a run folder unpacks to: twenty times those of the finest preset.
 MOST_UNPACKED = 2**30
@@ -57,6 +58,24 @@ def write_bytes(path: str | Path, data: bytes) -> Path:
     return target
 
 
+def check_paths(values: Iterable[Any]) -> None:
+    """See that paths among values, and tuples of them, can be those of files.
+
+    Raises:
+        ParameterError: one has a null character, or a name that is too long.
+    """
+    for value in values:
+        if isinstance(value, tuple):
+            check_paths(value)
+        elif isinstance(value, Path):
+            try:
+                value.lstat()
+            except (OSError, ValueError) as error:
+                if not isinstance(error, OSError) or error.errno == errno.ENAMETOOLONG:
+                    fault = error.strerror if isinstance(error, OSError) else error
+                    raise ParameterError(f"{str(value)[:80]!r} is no usable path ({fault})") from error
+
+
 def check_folder(path: str | Path) -> None:
     """See that results can go into a folder, which need not exist yet, before hours are spent on them; writes nothing.
 
@@ -64,12 +83,7 @@ def check_folder(path: str | Path) -> None:
         RunError: a file is in the way, the folder is a measurement set, or it can't be written to.
     """
     folder = Path(path).absolute()
-    try:
-        folder.lstat()
-    except (FileNotFoundError, NotADirectoryError):
-        pass
-    except (OSError, ValueError) as error:  # a name that no file can have
-        raise RunError(f"{path}: is no usable path ({error}); choose another folder for the result") from error
+    check_paths([folder])
     if (folder / "experiment.json").exists():
         raise RunError(f"{path}: is a measurement set, which is not written to; choose another folder for the result")
     there = next(place for place in (folder, *folder.parents) if place.exists())

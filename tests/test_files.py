@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatsoil.errors import RunError
+from splatsoil.errors import ParameterError, RunError
 from splatsoil.files import (
     CRITICISM,
     FORWARD,
@@ -158,7 +158,7 @@ def test_a_folder_for_results_is_refused_before_work_is_spent_on_it(place: str, 
     (tmp_path / "set").mkdir()
     (tmp_path / "set" / "experiment.json").write_text("{}")
     (tmp_path / "file").write_text("")
-    with pytest.raises(RunError, match=says):
+    with pytest.raises((ParameterError, RunError), match=says):
         check_folder(tmp_path / place)
     check_folder(tmp_path / "set" / "runs" / "one")
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["experiment.json", "file", "set"]

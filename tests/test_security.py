@@ -22,6 +22,7 @@ import trimesh
 from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli, trust
+from splatsoil.cli import main
 from splatsoil.errors import MeasurementError, RunError
 from splatsoil.files import MOST_UNPACKED, read_json, read_npy, read_npz, write_json
 from splatsoil.measurement import Measurement
@@ -287,6 +288,17 @@ def test_links_out_of_a_set_are_refused(small_set: Path, tmp_path: Path, name: s
     (small_set / name).symlink_to(outside)
     with pytest.raises(MeasurementError, match="leaves the measurement set"):
         Measurement.load(small_set)
+
+
+@pytest.mark.parametrize("name", ["images/\x1b[31mred.jpg", "images/\udcff.jpg", "images/\u202egpj.exe"])
+def test_an_error_does_not_act_on_the_terminal(name: str, small_set: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = small_set / "views" / "transforms.json"
+    views = json.loads(file.read_text())
+    views["frames"][1]["file_path"] = name
+    file.write_text(json.dumps(views))
+    assert main(["check", str(small_set)]) == 2
+    said = capsys.readouterr().err.rstrip("\n")
+    assert said.isprintable() and said.count("frames[1].file_path") == 1
 
 
 def test_names_in_a_set_reach_terminal_and_page_as_they_are(

@@ -157,7 +157,7 @@ def _filled(root: Path, options: ImportOptions, report: Report) -> Imported:
     if videos:
         write_frames(root / "video", filmed(), video=True)
     report("checking", 0.9)
-    missing = _finish(root, experiment.data, rate, options.out)
+    missing = _finish(root, experiment.data, rate)
     frames = {name: len(numbers) for name, numbers in wanted.items()}
     return Imported(found.kind, len(views), similarity, marks, left, frames, clock, tags, missing)
 
@@ -249,7 +249,7 @@ def _wanted(video: Video, zero: int, last: int | None, every: int) -> set[int]:
     return wanted
 
 
-def _finish(root: Path, experiment: dict[str, Any], rate: float, out: Path) -> tuple[str, ...]:
+def _finish(root: Path, experiment: dict[str, Any], rate: float) -> tuple[str, ...]:
     """Write experiment.json and check the set, or what there is of it; returns the parts that it lacks."""
     there = {name: name for name in ("tool.stl", "tool_motion.csv", "tool_force.csv") if (root / name).is_file()}
     tool = dict(experiment["tool"]) if isinstance(experiment.get("tool"), dict) else {}
@@ -261,12 +261,9 @@ def _finish(root: Path, experiment: dict[str, Any], rate: float, out: Path) -> t
     whole = {"format": FORMAT, **notes, "tool": tool, "frame_rate": rate, **parts}
     missing = [name for name, key in (("bed", "bed"), ("gravity", "gravity"), ("video", "video")) if key not in whole]
     missing += [f"tool.{key}" for key in ("mesh", "motion") if key not in tool]
-    try:
-        if missing:
-            read_transforms(root / "views" / "transforms.json", root, video=False)
-        else:
-            write_json(root / EXPERIMENT, whole)
-            Measurement.load(root)
-    except MeasurementError as error:
-        raise MeasurementError(str(error).replace(str(root.absolute()), str(out))) from error
+    if missing:
+        read_transforms(root / "views" / "transforms.json", root, video=False)
+    else:
+        write_json(root / EXPERIMENT, whole)
+        Measurement.load(root)
     return tuple(missing)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from splatsoil.experiment.triaxial import TriaxialExperiment
 from splatsoil.files import write_text
 from splatsoil.measurement.fields import Fields, read_table, read_text
 from splatsoil.measurement.measurement import EXPERIMENT
+from splatsoil.measurement.writer import whole_folder, write_json
 from splatsoil.soil.effect import Effect
 from splatsoil.soil.packing import of_limits
 
@@ -108,19 +108,16 @@ def simulate(
 
     Raises:
         ParameterError: values that the model doesn't take.
-        MeasurementError: the folder is not empty.
+        MeasurementError: the folder is not empty, or its name is none for a set.
     """
-    if out.exists() and any(out.iterdir()):
-        raise MeasurementError("is not empty; choose another folder", file=out)
     shape = KINDS[kind].example(out.name or kind, Options(tuple(effects), preset=preset))
     shape.law(()).require_on({**shape.values(values), **_off(shape, values)})
-    description, tables = KINDS[kind].write(shape, shape.readings(Run(values, seed=seed)))
-    write_text(
-        out / EXPERIMENT,
-        json.dumps({"format": FORMAT, "kind": kind, "name": out.name or kind, **description}, indent=1) + "\n",
-    )
-    for name, text in tables.items():
-        write_text(out / name, text)
+    with whole_folder(out) as root:
+        description, tables = KINDS[kind].write(shape, shape.readings(Run(values, seed=seed)))
+        write_json(root / EXPERIMENT, {"format": FORMAT, "kind": kind, "name": out.name or kind, **description})
+        for name, text in tables.items():
+            write_text(root / name, text)
+        load(root)
     return shape
 
 

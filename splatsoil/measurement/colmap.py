@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,7 @@ from splatsoil.measurement.frames import Frame
 from splatsoil.measurement.images import check_image
 
 FloatArray = npt.NDArray[np.float64]
+Number = TypeVar("Number", int, float)
 
 # COLMAP's models by number, and how many parameters each has: what is not read is skipped where no image uses it.
 _MODELS = (
@@ -100,20 +101,12 @@ def _lines(file: Path) -> list[str]:
     return [line.strip() for line in read_text(file).splitlines() if not line.startswith("#")]
 
 
-def _numbers(words: Sequence[str], file: Path, field: str) -> tuple[float, ...]:
+def _numbers(words: Sequence[str], file: Path, field: str, kind: Callable[[str], Number]) -> tuple[Number, ...]:
     try:
-        return tuple(float(word) for word in words)
+        return tuple(kind(word) for word in words)
     except ValueError as error:
-        raise MeasurementError(f"expected numbers, found {' '.join(words)[:60]!r}", file=file, field=field) from error
-
-
-def _whole(words: Sequence[str], file: Path, field: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(word) for word in words)
-    except ValueError as error:
-        raise MeasurementError(
-            f"expected whole numbers, found {' '.join(words)[:60]!r}", file=file, field=field
-        ) from error
+        what = f"expected {'whole ' if kind is int else ''}numbers, found {' '.join(words)[:60]!r}"
+        raise MeasurementError(what, file=file, field=field) from error
 
 
 def _read_cameras_txt(file: Path) -> dict[int, _Calibration]:
@@ -122,8 +115,8 @@ def _read_cameras_txt(file: Path) -> dict[int, _Calibration]:
         words = line.split()
         if len(words) < 5:
             raise MeasurementError("expected CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", file=file, field=line[:40])
-        identity, width, height = _whole([words[0], *words[2:4]], file, line[:40])
-        out[identity] = words[1], width, height, _numbers(words[4:], file, f"camera {identity}, PARAMS")
+        identity, width, height = _numbers([words[0], *words[2:4]], file, line[:40], int)
+        out[identity] = words[1], width, height, _numbers(words[4:], file, f"camera {identity}, PARAMS", float)
     return out
 
 
@@ -138,7 +131,10 @@ def _read_images_txt(file: Path) -> list[_Pose]:
             raise MeasurementError(
                 "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", file=file, field=line[:40]
             )
-        values, (camera,) = np.array(_numbers(words[1:8], file, words[9])), _whole(words[8:9], file, words[9])
+        values, (camera,) = (
+            np.array(_numbers(words[1:8], file, words[9], float)),
+            _numbers(words[8:9], file, words[9], int),
+        )
         out.append((camera, words[9], values[:4], values[4:]))
     return out
 

@@ -31,8 +31,9 @@ FRAME_FIELDS = (*LENS_FIELDS, "file_path", "transform_matrix", "mask_path", "dep
 VIDEO_FIELDS = ("camera", "frame", "time")
 # What describes a lens or a shutter in formats alike: COLMAP's, Metashape's, OpenCV's, nerfstudio's and instant-ngp's.
 _LENS_KEY = re.compile(
-    r"[kpsb]\d|skew|.*dist(ortion)?(_.*)?|ftheta.*|fisheye_crop_radius|rolling_shutter.*"
-    r"|equirectangular|latlong|orthographic"
+    r"[kpsb]\d|skew|\w*distortion\w*|dist(_?coeff\w*)?|ftheta\w*|fisheye_crop_radius|rolling_shutter\w*"
+    r"|equirectangular|latlong|orthographic",
+    re.IGNORECASE,
 )
 _FOCAL_SLACK = 0.01  # further apart than digits that were cut off explain
 

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import MeasurementError
+from splatsoil.files import check_paths
 from splatsoil.measurement.camera import Camera
 from splatsoil.measurement.fields import Fields, inside
 from splatsoil.measurement.frames import Frame, read_transforms
@@ -137,11 +138,9 @@ class Measurement:
         """
         root = Path(folder).absolute()  # images are read later, perhaps from another working folder
         file = root / EXPERIMENT
-        try:
-            fault = "" if root.is_dir() else "not a folder" if root.exists() else "no such folder"
-        except OSError as error:
-            fault = f"no folder ({error.strerror})"
-        if fault:
+        check_paths([root])
+        if not root.is_dir():
+            fault = "not a folder" if root.exists() else "no such folder"
             raise MeasurementError(f"{fault}; give the folder of a measurement set", file=root)
         if not file.is_file():
             raise MeasurementError(f"no {EXPERIMENT} in this folder; it is no measurement set", file=file)

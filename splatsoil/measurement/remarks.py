@@ -81,8 +81,8 @@ def _on_views(measurement: Measurement) -> Iterator[str]:
 
 def _on_video(measurement: Measurement) -> Iterator[str]:
     frames, motion, rate = measurement.frames, measurement.tool.motion, measurement.frame_rate
-    if not frames:
-        yield "All video frames are pre-roll (negative numbers); there is nothing to compare with."
+    if len(frames) < 2:
+        yield "There are not two frames from number 0 on, which changes are compared between: nothing to compare with."
     if measurement.video and not measurement.pre_roll:
         yield "There is no pre-roll (frames with negative numbers), so the noise cannot be measured."
     for name in measurement.cameras:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from splatsoil.errors import MeasurementError
+from splatsoil.files import check_paths
 from splatsoil.measurement.camera import Camera
 from splatsoil.measurement.frames import Frame
 from splatsoil.measurement.heights import HeightMaps
@@ -140,15 +141,15 @@ def whole_folder(target: Path) -> Iterator[Path]:
     Raises:
         MeasurementError: the place is taken or can't be written.
     """
+    check_paths([target])
     try:
         target.lstat()
         taken = not target.is_dir() or any(target.iterdir())
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         taken = False
-    except (OSError, ValueError) as error:  # also a name that no file can have
-        raise MeasurementError(f"cannot be written ({error}); choose another place", file=target) from error
     if taken:
         raise MeasurementError("already there and not an empty folder; nothing is overwritten", file=target)
+    root = target
     new = [p for p in target.absolute().parents if not p.exists()]
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -163,6 +164,8 @@ def whole_folder(target: Path) -> Iterator[Path]:
         for folder in new:
             with suppress(OSError):
                 folder.rmdir()
+        if isinstance(error, MeasurementError):  # it lies at its own place for a reader
+            error.args = (str(error).replace(str(root.absolute()), str(target)),)
         if not isinstance(error, OSError):
             raise
         message = f"cannot be written ({error.strerror}); choose another place"
