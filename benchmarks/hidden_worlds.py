@@ -35,6 +35,7 @@ from splatsoil.benchmarks._common import (
 )
 from splatsoil.benchmarks._hidden import KINDS, NOTHING, OUTSIDE, TIMES, Hidden, draw
 from splatsoil.benchmarks._newton import Numerics, plough
+from splatsoil.inverse.criticism.evidence import BASE_MODEL, DISCREPANCY
 
 from splatsoil.errors import ParameterError
 from splatsoil.files import plain, read_json
@@ -46,7 +47,7 @@ OWN = ("_hidden", "_newton", "_scenes", "hidden_worlds")
 """Modules beside the package by which the experiments are made."""
 NEWTON = "newton"
 """The other solver; ours go by their presets."""
-ELSE = "something else"
+ELSE = DISCREPANCY
 """The model of what no effect explains, and its verdict."""
 OPEN = (ELSE, "undecided")
 LEAST = 1e-6
@@ -138,7 +139,7 @@ def score(hidden: Hidden, fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) 
     ``size`` is that of the effect's parameter, ``times`` and ``detectable`` are over its smallest meaningful change.
     """
     models = {model["name"]: model for model in diagnosis["models"]}
-    truth = {NOTHING: "", **dict.fromkeys(OUTSIDE, ELSE)}.get(hidden.kind, hidden.kind)
+    truth = {NOTHING: BASE_MODEL, **dict.fromkeys(OUTSIDE, ELSE)}.get(hidden.kind, hidden.kind)
     best, angle, verdict = diagnosis["models"][0], diagnosis["estimates"]["friction_angle"], diagnosis["verdict"]
     named = diagnosis["class"] if verdict in ("missing", "one of") else []
     row = {
@@ -149,7 +150,7 @@ def score(hidden: Hidden, fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) 
         "verdict": verdict,
         "class": diagnosis["class"],
         "named": named,
-        "right": truth in {"adequate": [""], ELSE: [ELSE]}.get(verdict, named),
+        "right": truth in {"adequate": [BASE_MODEL], ELSE: [ELSE]}.get(verdict, named),
         "best": best["name"],
         "probabilities": {name: model["probability"] for name, model in models.items()},
         "angle_found": [angle["value"], angle["std"]],
@@ -174,7 +175,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     lines = []
     for r in sorted(rows, key=lambda r: (r["right"], r["hidden"])):
         size = f"{r['size']:.3g}" + (f" ({r['times']:.1f})" if "times" in r else "") if r["truth"] else "–"
-        shares = f"{_probability(r, [r['truth']]):.2f}, {_probability(r, ['']):.2f}"
+        shares = f"{_probability(r, [r['truth']]):.2f}, {_probability(r, [BASE_MODEL]):.2f}"
         angle = f"{r['angle']:.1f}°; {r['angle_found'][0]:.1f} ± {r['angle_found'][1]:.1f}° ({r['z']:+.1f})"
         found = "{:.3g} ± {:.2g}".format(*r["size_found"]) if "size_found" in r else "–"
         seconds = "{:.0f}, {:.0f} s".format(*r["seconds"])
