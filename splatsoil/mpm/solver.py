@@ -22,7 +22,7 @@ from splatsoil.errors import SimulationError
 from splatsoil.mpm.grid import GridShape
 from splatsoil.mpm.presets import Resolution
 from splatsoil.mpm.start import at_rest
-from splatsoil.mpm.state import Cells, Nodes, Particles
+from splatsoil.mpm.state import Cells, Contacts, Nodes, Particles
 from splatsoil.mpm.substep import contact_forces, make_stress_kernel, move_nodes
 from splatsoil.mpm.tool import Pose, build_tool
 from splatsoil.mpm.transfer import (
@@ -192,7 +192,11 @@ class Solver:
         c.history, c.depth = wp.zeros(kept, dtype=wp.vec2, device=device), floats(kept)
         self._cells = c
 
-        self._near, self._near_weight, self._near_count = ints(n), floats(8 * n), ints(1)
+        near = Contacts()
+        near.particle, near.weight, near.count = ints(n), floats(8 * n), ints(1)
+        near.area, near.deepest = self.resolution.spacing**2, DEEPEST * self.resolution.spacing
+        self._contacts = near
+
         self._broken, self._strays = ints(1), ints(1)
         self._pose = floats(13)
         self._force = vectors(self.simulations)
@@ -272,7 +276,7 @@ class Solver:
         dt = step_time / substeps
         modulus = r.bulk + 4.0 * r.shear / 3.0
         n, node_count, cell_count = p.position.shape[0], g.mass.shape[0], c.node.shape[0]
-        for array in (g.mass, g.inertia, g.velocity, g.force, g.displacement, g.count, c.count, self._near_count):
+        for array in (g.mass, g.inertia, g.velocity, g.force, g.displacement, g.count, c.count, self._contacts.count):
             array.zero_()
         c.slot.fill_(-1)
         wp.launch(mark_cells, dim=n, inputs=[p, c, grid], device=device)
@@ -328,32 +332,18 @@ class Solver:
 
     def _contact(self, dt: float, share: float) -> wp.Launch:
         """Find the particles near the tool, and make ready the launch of what runs in every substep."""
-        p, device, reach = self._particles, self.device, self.resolution.cell
+        p, device, near = self._particles, self.device, self._contacts
         n = p.position.shape[0]
-        near = [self.tool, self._pose, reach, self._near, self._near_weight, self._near_count]
-        wp.launch(find_gaps, dim=n, inputs=[p, self.grid, *near], device=device)
+        wp.launch(
+            find_gaps, dim=n, inputs=[p, self.grid, self.tool, self._pose, self.resolution.cell, near], device=device
+        )
         if not self._met:
             wp.launch(allow_start, dim=n, inputs=[p], device=device)
             self._met = True
         return wp.launch(
             contact_forces,
-            dim=self._size(self._near_count, n),
-            inputs=[
-                p,
-                self._nodes,
-                self.grid,
-                self.tool,
-                self._pose,
-                self._near,
-                self._near_weight,
-                self._near_count,
-                self.resolution.spacing**2,
-                DEEPEST * self.resolution.spacing,
-                dt,
-                share,
-                self._table,
-                self._force,
-            ],
+            dim=self._size(near.count, n),
+            inputs=[p, self._nodes, self.grid, self.tool, self._pose, near, dt, share, self._table, self._force],
             device=device,
             record_cmd=True,
         )

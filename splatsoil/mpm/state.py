@@ -84,6 +84,25 @@ class Nodes:
 
 
 @wp.struct
+class Contacts:
+    """Particles near the tool, packed.
+
+    Attributes:
+        particle: number of each.
+        weight: of the eight corners of its cell, by which contact acts on them; entry 8 * contact + corner.
+        count: how many there are.
+        area: of the tool that a particle covers, m^2.
+        deepest: compression to which a contact spring is loaded at most, m.
+    """
+
+    particle: wp.array(dtype=int)
+    weight: wp.array(dtype=float)
+    count: wp.array(dtype=int)
+    area: float
+    deepest: float
+
+
+@wp.struct
 class Cells:
     """Cells with soil in them, packed; each is one stress point.
 

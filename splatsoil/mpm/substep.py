@@ -9,7 +9,7 @@ import warp as wp
 
 from splatsoil.mpm.compiler import OPTIONS
 from splatsoil.mpm.grid import Grid, base_node, cell_of, corner_offset, corner_weight, local_coordinates
-from splatsoil.mpm.state import Cells, Nodes, Particles
+from splatsoil.mpm.state import Cells, Contacts, Nodes, Particles
 from splatsoil.mpm.tool import Tool, signed_distance, tool_position, tool_rotation, tool_velocity
 from splatsoil.soil.law import (
     FLOOR_FRICTION,
@@ -103,11 +103,7 @@ def contact_forces(
     grid: Grid,
     tool: Tool,
     pose: wp.array(dtype=float),
-    near: wp.array(dtype=int),
-    weight: wp.array(dtype=float),
-    count: wp.array(dtype=int),
-    area: float,
-    deepest: float,
+    contacts: Contacts,
     dt: float,
     share: float,
     values: wp.array2d(dtype=float),
@@ -115,18 +111,18 @@ def contact_forces(
 ) -> None:
     """Penalty contact with Coulomb friction between particles and tool; ``force`` (simulations) gains share * force.
 
-    ``area`` (m^2) is what one particle covers of the tool; a spring is loaded no further than ``deepest`` (m), so that
-    soil in which a tool starts is not shot out of it. Friction is a tangential spring whose force returns to Coulomb's
+    A spring is loaded no further than ``contacts.deepest``, so that soil in which a tool starts is not shot out of it.
+    Friction is a tangential spring whose force returns to Coulomb's
     limit where it exceeds it, so that soil sticks or slips, and does neither by the step's length (Wriggers 2006,
     Computational Contact Mechanics, sec. 5.2 and 10.5; Cundall & Strack 1979).
 
     A particle keeps the side of the tool it is on, so a plate thinner than a cell holds soil on both its faces, and
     what the soil feels is exactly what the tool feels. It moves with the whole field of its cell, and is held by the
-    ``weight`` of the corners that the tool covers (:func:`~splatsoil.mpm.transfer.find_gaps`).
+    weights of the corners that the tool covers (:func:`~splatsoil.mpm.transfer.find_gaps`).
     """
     i = wp.tid()
-    if i < count[0]:
-        p = near[i]
+    if i < contacts.count[0]:
+        p = contacts.particle[i]
         row = p / particles.per_simulation
         x = particles.position[p]
         cell = cell_of(grid, x)
@@ -149,9 +145,9 @@ def contact_forces(
             gap = signed_distance(tool, wp.quat_rotate_inv(tool_rotation(pose), place))
         particles.gap[p] = gap
         depth = preload - gap
-        adhesion = values[row, TOOL_ADHESION] * area
-        if depth > 0.0 or (adhesion > 0.0 and gap < ADHESION_REACH * wp.sqrt(area)):
-            spring = tool.stiffness * wp.clamp(depth, 0.0, deepest)
+        adhesion = values[row, TOOL_ADHESION] * contacts.area
+        if depth > 0.0 or (adhesion > 0.0 and gap < ADHESION_REACH * wp.sqrt(contacts.area)):
+            spring = tool.stiffness * wp.clamp(depth, 0.0, contacts.deepest)
             push = wp.where(depth > 0.0, wp.max(spring - tool.damping * closing, 0.0), 0.0)
             slip -= closing * normal
             grip = particles.grip[p]
@@ -167,7 +163,7 @@ def contact_forces(
             pull = push * normal - drag
             wp.atomic_add(force, row, -share * pull)
             for corner in range(8):
-                wp.atomic_add(nodes.force, base + corner_offset(grid, corner), weight[8 * i + corner] * pull)
+                wp.atomic_add(nodes.force, base + corner_offset(grid, corner), contacts.weight[8 * i + corner] * pull)
 
 
 @wp.func

@@ -16,7 +16,7 @@ from splatsoil.mpm.grid import (
     field_beside,
     local_coordinates,
 )
-from splatsoil.mpm.state import Cells, Nodes, Particles
+from splatsoil.mpm.state import Cells, Contacts, Nodes, Particles
 from splatsoil.mpm.tool import FAR, Tool, distance_normal, signed_distance, tool_position, tool_rotation
 
 wp.set_module_options(OPTIONS)
@@ -255,17 +255,9 @@ def momentum_to_velocity(nodes: Nodes) -> None:
 
 @wp.kernel(enable_backward=False)
 def find_gaps(
-    particles: Particles,
-    grid: Grid,
-    tool: Tool,
-    pose: wp.array(dtype=float),
-    reach: float,
-    near: wp.array(dtype=int),
-    weight: wp.array(dtype=float),
-    count: wp.array(dtype=int),
+    particles: Particles, grid: Grid, tool: Tool, pose: wp.array(dtype=float), reach: float, contacts: Contacts
 ) -> None:
-    """Distance and normal of each particle to the tool; those within ``reach`` (m) are listed in ``near``, with the
-    ``weight`` of the eight corners of the cell by which contact acts on them (entry 8 * listed + corner).
+    """Distance and normal of each particle to the tool; those within ``reach`` (m) are listed as contacts.
 
     Trilinear weights carry contact up to a cell beyond the tool's edges, as if it were wider and deeper. So a corner
     counts by 1 - d / l: l is its way from the point of contact along the tangent plane, d how far off the tool it ends.
@@ -279,8 +271,8 @@ def find_gaps(
         outward = distance_normal(tool, local)
         particles.gap_normal[p] = wp.quat_rotate(rotation, outward)
         particles.drift[p] = wp.vec3(0.0)
-        listed = wp.atomic_add(count, 0, 1)
-        near[listed] = p
+        listed = wp.atomic_add(contacts.count, 0, 1)
+        contacts.particle[listed] = p
         foot = local - gap * outward
         cell = cell_of(grid, particles.position[p])
         f = local_coordinates(grid, particles.position[p], cell)
@@ -291,13 +283,13 @@ def find_gaps(
             aside -= wp.dot(aside, outward) * outward
             beyond = signed_distance(tool, foot + aside) / wp.max(wp.length(aside), 1.0e-9)
             share = corner_weight(f, corner) * wp.clamp(1.0 - beyond, 0.0, 1.0)
-            weight[8 * listed + corner] = share
+            contacts.weight[8 * listed + corner] = share
             total += share
         for corner in range(8):
             if total > 0.0:
-                weight[8 * listed + corner] = weight[8 * listed + corner] / total
+                contacts.weight[8 * listed + corner] = contacts.weight[8 * listed + corner] / total
             else:
-                weight[8 * listed + corner] = corner_weight(f, corner)
+                contacts.weight[8 * listed + corner] = corner_weight(f, corner)
 
 
 @wp.kernel(enable_backward=False)

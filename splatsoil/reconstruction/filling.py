@@ -5,17 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Bed
 from splatsoil.mpm.grid import nearest
 from splatsoil.reconstruction.height_field import HeightField, centres
 
-Array = NDArray[np.float64]
-
 _SAMPLES = 4  # heights sampled along each side of a column
 
 
-def fill(surface: HeightField, bed: Bed, spacing: float, seed: int = 0, jitter: float = 0.5) -> Array:
+def fill(surface: HeightField, bed: Bed, spacing: float, seed: int = 0, jitter: float = 0.5) -> FloatArray:
     """Particles that fill the bed from its floor to the surface, each standing for `spacing`³ of soil.
 
     Where nothing stands at the bed's sides, its whole `Bed.domain` is filled, the surface's border carried on.
@@ -69,7 +68,7 @@ def fill(surface: HeightField, bed: Bed, spacing: float, seed: int = 0, jitter: 
     return np.stack([x, y, z], axis=1)
 
 
-def column_depths(surface: HeightField, bed: Bed, nx: int, ny: int) -> Array:
+def column_depths(surface: HeightField, bed: Bed, nx: int, ny: int) -> FloatArray:
     """(ny, nx) mean depth of the soil over the floor in equal columns, metres."""
     fine = [centres(bed.lower[k], bed.upper[k], n * _SAMPLES) for k, n in enumerate((nx, ny))]
     depth = np.maximum(surface.smooth(np.stack(np.meshgrid(*fine), axis=-1)) - bed.lower[2], 0.0)
@@ -83,7 +82,7 @@ def volume(surface: HeightField, bed: Bed) -> float:
     return float(column_depths(surface, bed, nx, ny).sum() * area)
 
 
-def _rounded(share: Array, start: float) -> NDArray[np.int64]:
+def _rounded(share: FloatArray, start: float) -> NDArray[np.int64]:
     """Whole numbers whose running sum along a meandering path stays within one of the shares' sum."""
     path = share.copy()
     path[1::2] = path[1::2, ::-1]

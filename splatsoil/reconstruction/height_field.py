@@ -5,19 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import map_coordinates
 
-Array = NDArray[np.float64]
+from splatsoil.arrays import FloatArray
 
 
-def centres(low: float, high: float, count: int) -> Array:
+def centres(low: float, high: float, count: int) -> FloatArray:
     """(count,) middles of equal parts of a stretch."""
     return low + (np.arange(count) + 0.5) * (high - low) / count
 
 
-def around(lower: Array, upper: Array, spacing: float) -> tuple[Array, Array]:
+def around(lower: FloatArray, upper: FloatArray, spacing: float) -> tuple[FloatArray, FloatArray]:
     """Points (n, 2) on a rectangle's border, and outward normals (n, 3)."""
     points, normals = [], []
     for axis in (0, 1):
@@ -42,10 +41,10 @@ class HeightField:
         deviation: (ny, nx) standard deviation of each height as its maker knows it, metres; None if unknown.
     """
 
-    x: Array
-    y: Array
-    height: Array
-    deviation: Array | None = None
+    x: FloatArray
+    y: FloatArray
+    height: FloatArray
+    deviation: FloatArray | None = None
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "height", "deviation"):
@@ -64,7 +63,7 @@ class HeightField:
                 raise ValueError("the cell centres of a height field must rise evenly")
 
     @classmethod
-    def over(cls, lower: Array, upper: Array, cell: float, height: float | Array = 0.0) -> HeightField:
+    def over(cls, lower: FloatArray, upper: FloatArray, cell: float, height: float | FloatArray = 0.0) -> HeightField:
         """Cells of about `cell` metres that fill the rectangle from `lower` to `upper` exactly (z is not used)."""
         x, y = (centres(lower[k], upper[k], max(2, round(float(upper[k] - lower[k]) / cell))) for k in (0, 1))
         return cls(x, y, np.broadcast_to(np.asarray(height, dtype=np.float64), (len(y), len(x))).copy())
@@ -75,19 +74,19 @@ class HeightField:
         return float(self.x[1] - self.x[0]), float(self.y[1] - self.y[0])
 
     @property
-    def points(self) -> Array:
+    def points(self) -> FloatArray:
         """(ny, nx, 3) the cell centres on the surface."""
         xs, ys = np.meshgrid(self.x, self.y)
         return np.stack([xs, ys, self.height], axis=-1)
 
     @property
-    def normals(self) -> Array:
+    def normals(self) -> FloatArray:
         """(ny, nx, 3) unit upward normals by central differences."""
         slope_y, slope_x = np.gradient(self.height, self.cell[1], self.cell[0])
         normal = np.stack([-slope_x, -slope_y, np.ones_like(self.height)], axis=-1)
         return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
 
-    def sample(self, xy: Array) -> Array:
+    def sample(self, xy: FloatArray) -> FloatArray:
         """Heights (...) at points (..., 2): bilinear between cell centres, and held constant beyond the outermost ones.
 
         Cells without a height (NaN) make the points next to them NaN.
@@ -96,7 +95,7 @@ class HeightField:
         row = (xy[..., 1] - self.y[0]) / self.cell[1]
         return map_coordinates(self.height, [row, column], order=1, mode="nearest")
 
-    def smooth(self, xy: Array) -> Array:
+    def smooth(self, xy: FloatArray) -> FloatArray:
         """Heights (...) at points (..., 2) by a cubic spline through the cell centres, carried on beyond by its slope.
 
         Unlike `sample` it does not flatten crests or the half cell at the border. All heights must be finite.
@@ -111,7 +110,7 @@ class HeightField:
             value[out] += spline.ev(inside[out, 1], inside[out, 0], **order_of) * beyond[out, axis]
         return value
 
-    def widened(self, lower: Array, upper: Array) -> HeightField:
+    def widened(self, lower: FloatArray, upper: FloatArray) -> HeightField:
         """This field out to a rectangle (2,) or (3,) around it, m, its outermost heights carried on level: by as many
         whole cells as cover it."""
         axes, around = [], []
@@ -124,7 +123,7 @@ class HeightField:
         deviation = None if self.deviation is None else np.pad(self.deviation, around[::-1], mode="edge")
         return HeightField(axes[0], axes[1], height, deviation)
 
-    def difference(self, other: HeightField) -> Array:
+    def difference(self, other: HeightField) -> FloatArray:
         """(ny, nx) this height minus the other's at this field's cells; NaN where either is unknown."""
         if self.height.shape == other.height.shape and np.allclose(self.x, other.x) and np.allclose(self.y, other.y):
             return self.height - other.height

@@ -9,11 +9,10 @@ import numpy.typing as npt
 from scipy.interpolate import griddata
 from scipy.ndimage import binary_dilation
 
+from splatsoil.arrays import FloatArray
 from splatsoil.measurement import Measurement
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.views import surface_points
-
-FloatArray = npt.NDArray[np.float64]
 
 TOOL_MARGIN = 2
 """Cells around the tool's outline, seen from above, that are left out: there soil leans on it, and rays graze it."""

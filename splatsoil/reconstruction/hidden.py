@@ -9,14 +9,12 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from splatsoil.arrays import FloatArray
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.splats import Gaussians
-
-FloatArray = npt.NDArray[np.float64]
 
 _VISIBLE = 0.02
 """Opacity in the soil from which a Gaussian reaches into it. Measured on both example sets with their true particles:

@@ -10,14 +10,13 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from splatsoil.arrays import FloatArray
 from splatsoil.measurement import Bed
 from splatsoil.reconstruction.height_field import HeightField, around
 from splatsoil.reconstruction.stereo import colours_seen
 from splatsoil.reconstruction.surface import Geometry, scale_of
 from splatsoil.reconstruction.views import Views, surface_points
 from splatsoil.splats import Gaussians
-
-Array = NDArray[np.float64]
 
 SURROUNDINGS, SOIL, TOOL, SIDE = 0, 1, 2, 3
 
@@ -39,13 +38,13 @@ class Seeds:
         label: (n,) SURROUNDINGS, SOIL (its surface), TOOL or SIDE (of the soil).
     """
 
-    points: Array
-    normals: Array
-    spacing: Array
+    points: FloatArray
+    normals: FloatArray
+    spacing: FloatArray
     label: NDArray[np.int8]
 
     @classmethod
-    def of(cls, points: Array, normals: Array, spacing: float | Array, label: int) -> Seeds:
+    def of(cls, points: FloatArray, normals: FloatArray, spacing: float | FloatArray, label: int) -> Seeds:
         n = len(points)
         return cls(points, normals, np.broadcast_to(spacing, (n,)).astype(float), np.full(n, label, dtype=np.int8))
 
@@ -104,7 +103,9 @@ def seed_sides(geometry: Geometry, bed: Bed, spacing: float) -> Seeds:
     return _upright(xy, outward, np.full(len(xy), bed.lower[2]), geometry.surface.sample(xy), spacing, SIDE)
 
 
-def _upright(xy: Array, normals: Array, low: Array, high: Array, spacing: float, label: int) -> Seeds:
+def _upright(
+    xy: FloatArray, normals: FloatArray, low: FloatArray, high: FloatArray, spacing: float, label: int
+) -> Seeds:
     """Discs on upright faces through points (n, 2) with normals (n, 3), from one height (n,) to another."""
     count = np.maximum(np.ceil((high - low) / spacing - 0.5), 0.0)
     level, which = np.nonzero(np.arange(count.max(initial=0.0))[:, None] < count)
@@ -146,7 +147,7 @@ def seed_far(views: Views, bed: Bed, geometry: Geometry) -> Seeds:
     return Seeds.of(every[kept], facing[kept], spacing[kept], SURROUNDINGS)
 
 
-def _thinned(points: Array, spacing: Array, allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _thinned(points: FloatArray, spacing: FloatArray, allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Indices of points no closer together than about their spacing: one per cell of grids whose size doubles."""
     level = np.floor(np.log2(spacing / spacing[allowed].min())).astype(np.int64)
     kept = []
@@ -163,7 +164,7 @@ def _thinned(points: Array, spacing: Array, allowed: NDArray[np.bool_]) -> NDArr
     return np.concatenate(result)
 
 
-def disc_colours(views: Views, geometry: Geometry, seeds: Seeds, *, batch: int = 8192) -> Array:
+def disc_colours(views: Views, geometry: Geometry, seeds: Seeds, *, batch: int = 8192) -> FloatArray:
     """(n, 3) median colour of each disc over the photographs that see it.
 
     Discs that none sees get the colour of the nearest one that is seen.
@@ -185,7 +186,7 @@ def disc_colours(views: Views, geometry: Geometry, seeds: Seeds, *, batch: int =
     return colour
 
 
-def discs(seeds: Seeds, colours: Array, opacity: float) -> Gaussians:
+def discs(seeds: Seeds, colours: FloatArray, opacity: float) -> Gaussians:
     """Flat Gaussians whose shortest axis is the seed's normal."""
     normal = seeds.normals / np.linalg.norm(seeds.normals, axis=1, keepdims=True)
     # The rotation that takes z to the normal; for a normal of −z, half a turn about x.

@@ -8,12 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from splatsoil.arrays import BoolArray, FloatArray
 from splatsoil.measurement import Bed
 from splatsoil.reconstruction.views import Views
 from splatsoil.splats import Gaussians, rasterise
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -27,16 +25,16 @@ class Likeness:
         control: (v,) the same with the drawn soil turned by half a turn in the image, for the null hypothesis.
     """
 
-    correlation: Array
-    control: Array
+    correlation: FloatArray
+    control: FloatArray
 
-    def unlike(self, fixed: int) -> Flags:
+    def unlike(self, fixed: int) -> BoolArray:
         """Which of the last ``fixed`` pictures are less like the scene than any other: a rank test, by which one of
         v + 1 is said to differ that does not."""
         others = self.correlation[:-fixed][np.isfinite(self.correlation[:-fixed])]
         return self.correlation[-fixed:] < others.min() if len(others) else np.zeros(fixed, dtype=bool)
 
-    def unrelated(self, fixed: int) -> Flags:
+    def unrelated(self, fixed: int) -> BoolArray:
         """Which of the last ``fixed`` pictures are no more like the scene than any picture is upside down.
 
         A rank test: of pictures that have nothing in common with the scene, one in v + 1 passes. It tells nothing where
@@ -82,15 +80,15 @@ def likeness(
     return Likeness(*np.array(out).reshape(-1, 2).T)
 
 
-def _correlation(one: NDArray[np.float32], other: NDArray[np.float32], where: Flags) -> float:
+def _correlation(one: NDArray[np.float32], other: NDArray[np.float32], where: BoolArray) -> float:
     """By the median absolute deviations of sum and difference (Gnanadesikan & Kettenring 1972, Biometrics 28:81), NaN
     where there is nothing to compare."""
 
-    def scaled(values: Array) -> Array:
+    def scaled(values: FloatArray) -> FloatArray:
         away = values - np.median(values)
         return np.asarray(away / np.median(np.abs(away)))
 
-    def squared(values: Array) -> float:
+    def squared(values: FloatArray) -> float:
         return float(np.median(np.abs(values - np.median(values)))) ** 2
 
     if np.count_nonzero(where) < 2:

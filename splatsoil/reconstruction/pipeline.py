@@ -30,8 +30,6 @@ from splatsoil.reconstruction.views import Views, load_views, silhouettes, still
 from splatsoil.splats import Gaussians, psnr, rasterise, ssim
 from splatsoil.threads import one_thread
 
-Array = NDArray[np.float64]
-
 FEWEST_VIEWS = 3
 NO_BACKGROUND = (0.0, 0.0, 0.0)
 

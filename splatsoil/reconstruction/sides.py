@@ -6,17 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from splatsoil.arrays import FloatArray
 from splatsoil.colour import linear
 from splatsoil.measurement import Bed
 from splatsoil.reconstruction.height_field import HeightField, around
 from splatsoil.reconstruction.stereo import colours_seen
 from splatsoil.reconstruction.surface import Geometry, scale_of, with_rim
 from splatsoil.reconstruction.views import Views
-
-Array = NDArray[np.float64]
 
 _ALIKE = float(chi2.ppf(0.99, 2))
 """Squared Mahalanobis distance within which 99 % of one kind of colours lie."""
@@ -58,7 +56,7 @@ def sides_seen(views: Views, bed: Bed, geometry: Geometry) -> bool:
     return _alike(seen, soil) and not _alike(beside, soil)
 
 
-def _alike(some: Array, others: Array) -> bool:
+def _alike(some: FloatArray, others: FloatArray) -> bool:
     """Whether two sets of colours (n, 2) are of one kind, by the distance of their medians in their mean spread."""
     if min(len(some), len(others)) < 3:
         return False
@@ -67,7 +65,9 @@ def _alike(some: Array, others: Array) -> bool:
     return bool(apart @ np.linalg.pinv(spread) @ apart < _ALIKE)
 
 
-def _chromaticity(views: Views, discs: tuple[Array, Array], usable: torch.Tensor, occluder: HeightField) -> Array:
+def _chromaticity(
+    views: Views, discs: tuple[FloatArray, FloatArray], usable: torch.Tensor, occluder: HeightField
+) -> FloatArray:
     """Red and green (m, 2) of the sum of linear red, green and blue, of those of n discs that are seen."""
     near = 0.1 * max(occluder.cell)
     seen = colours_seen(views, discs, usable, occluder, near, near)

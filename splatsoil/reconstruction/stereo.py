@@ -18,15 +18,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sparse
 import torch
-from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 from torch.nn import functional
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.views import Views
-
-Array = NDArray[np.float64]
 
 # Standard deviation of the surface's curvature (1/m times the bed's length in m): a heap with a radius of a tenth of
 # the bed is not unusual, sharper edges are held by the data.
@@ -95,7 +93,7 @@ class Matching:
     normalised: bool = False
 
     def disagreement(
-        self, height: Array | float, sigma: float, *, levels: bool = False
+        self, height: FloatArray | float, sigma: float, *, levels: bool = False
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """How much each photograph differs from the others' mean around each cell.
 
@@ -123,7 +121,7 @@ class Matching:
             error = error / (_blur(both * weight, near) / _blur(weight, near).clamp_min(1e-6)).clamp_min(1e-6)
         return error[:, 0], weight[:, 0]
 
-    def sweep(self, heights: Array, *, sigma: float) -> Array:
+    def sweep(self, heights: FloatArray, *, sigma: float) -> FloatArray:
         """(ny, nx) the best of evenly spaced heights (k,) in each cell under a smoothness term; good to about a step.
 
         ``sigma`` is the window's standard deviation in cells.
@@ -152,8 +150,8 @@ class Matching:
         return smoothness.plate(trusted, height, 1.0, 0.0)
 
     def refine(
-        self, height: Array, *, reach: float, length: float, iterations: int = 8, sigma: float = 1.5
-    ) -> tuple[Array, Array]:
+        self, height: FloatArray, *, reach: float, length: float, iterations: int = 8, sigma: float = 1.5
+    ) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton from a good start.
 
         Args:
@@ -229,7 +227,7 @@ class Smoothness:
         self.bending = xx.T @ xx + yy.T @ yy + 2.0 * (xy.T @ xy)
         self.tension = x.T @ x + y.T @ y
 
-    def plate(self, weight: Array, target: Array, stiffness: float, tension: float) -> Array:
+    def plate(self, weight: FloatArray, target: FloatArray, stiffness: float, tension: float) -> FloatArray:
         """argmin Σ weight (h − target)² + stiffness · bending(h) + tension · tension(h), heights (ny, nx)."""
         diagonal = weight.ravel() + 1e-9 * float(weight.mean())
         energy = stiffness * self.bending + tension * self.tension
@@ -237,7 +235,7 @@ class Smoothness:
         return splu(system, permc_spec="MMD_AT_PLUS_A").solve(diagonal * target.ravel()).reshape(target.shape)
 
 
-def shrunk(total: Array, count: Array) -> Array:
+def shrunk(total: FloatArray, count: FloatArray) -> FloatArray:
     """Mean disagreement (…) of sums (…) over so many photographs (…), shrunk towards the usual one, as two agree by
     chance more easily than twenty."""
     usual = total.sum() / max(count.sum(), 1.0)
@@ -245,8 +243,13 @@ def shrunk(total: Array, count: Array) -> Array:
 
 
 def colours_seen(
-    views: Views, discs: tuple[Array, Array], usable: torch.Tensor, occluder: HeightField, lift: float, clearance: float
-) -> Array:
+    views: Views,
+    discs: tuple[FloatArray, FloatArray],
+    usable: torch.Tensor,
+    occluder: HeightField,
+    lift: float,
+    clearance: float,
+) -> FloatArray:
     """(n, 3) median colour of discs over the photographs that see their fronts; NaN where none does.
 
     Args:
@@ -265,7 +268,9 @@ def colours_seen(
     return known.nanmedian(dim=0).values.T.cpu().numpy().astype(np.float64)
 
 
-def visibility(views: Views, points: Array, surface: HeightField, *, clearance: float, steps: int = 32) -> torch.Tensor:
+def visibility(
+    views: Views, points: FloatArray, surface: HeightField, *, clearance: float, steps: int = 32
+) -> torch.Tensor:
     """(v, n) float32, 1 where a point is not hidden from a camera by a height field, by marching along the ray.
 
     Args:

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from scipy.ndimage import binary_propagation, distance_transform_edt
 from scipy.spatial import cKDTree
 from torch.nn import functional
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement import BIN, HEAP, TRANSPARENT, Bed
 from splatsoil.reconstruction.height_field import HeightField, around
@@ -21,7 +21,6 @@ from splatsoil.reconstruction.stereo import Matching, draw, shrunk, visibility
 from splatsoil.reconstruction.views import Views
 from splatsoil.splats import Gaussians
 
-Array = NDArray[np.float64]
 Report = Callable[[str, float], None]
 
 RIM = 0.04  # width of what is taken to border the bed (a bin's wall), in square roots of the bed's area
@@ -148,7 +147,7 @@ def wall_top(views: Views, bed: Bed, usable: torch.Tensor) -> float:
     return float(heights[int(np.argmax(np.diff(shrunk(total, count).mean(axis=1))))])
 
 
-def without_backdrop(height: Array, deviation: Array, length: float) -> tuple[Array, Array]:
+def without_backdrop(height: FloatArray, deviation: FloatArray, length: float) -> tuple[FloatArray, FloatArray]:
     """Heights (ny, nx) in which doubtful cells that reach in from the border repeat their nearest sure neighbour.
 
     Photographs that look past a corner of the bed agree on the plain ground behind it at any height, so a corner may

@@ -12,11 +12,10 @@ import torch.nn.functional as functional
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from splatsoil.arrays import FloatArray
 from splatsoil.measurement import Camera, Frame
 from splatsoil.scene.light import encoded, linear
 from splatsoil.splats import rasterise_features
-
-FloatArray = npt.NDArray[np.float64]
 
 BRIGHTEST = 2.0
 """Largest linear albedo, in units of level sunlit soil's mean; only errors lie beyond."""

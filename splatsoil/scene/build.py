@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import TRANSPARENT, Bed, Frame, Measurement
 from splatsoil.scene import albedo as albedos
@@ -26,7 +26,6 @@ from splatsoil.splats import Gaussians
 if TYPE_CHECKING:
     from splatsoil.reconstruction import Reconstruction
 
-FloatArray = npt.NDArray[np.float64]
 
 _FOOTPRINT = 0.002
 """Half width of the patch of surface that a Gaussian's colour was seen on, m, for shadows' edges."""

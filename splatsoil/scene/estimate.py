@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import torch.nn.functional as functional
 import trimesh
@@ -14,6 +13,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from splatsoil.arrays import FloatArray
 from splatsoil.measurement import Frame, Measurement
 from splatsoil.scene import kernels
 from splatsoil.scene.light import Light, linear
@@ -21,8 +21,6 @@ from splatsoil.scene.light_fit import FINEST, LAG, MovedShadow, fit_light
 from splatsoil.scene.relief import Relief
 from splatsoil.scene.tool import ToolBody
 from splatsoil.splats.warp_torch import as_warp, launch
-
-FloatArray = npt.NDArray[np.float64]
 
 _CELLS = 200
 """Cells along the longer side of the bed at which colours are compared."""

@@ -12,6 +12,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from splatsoil.arrays import FloatArray
 from splatsoil.measurement import Camera
 from splatsoil.scene import kernels
 from splatsoil.scene.kernels_maps import Surface, height_at
@@ -19,8 +20,6 @@ from splatsoil.scene.relief import Relief
 from splatsoil.scene.tool import eye_of
 from splatsoil.splats import Gaussians, rasterise_features
 from splatsoil.splats.warp_torch import as_warp, launch
-
-FloatArray = npt.NDArray[np.float64]
 
 _FAR = 1.0e6
 """Beyond everything, m."""

@@ -9,12 +9,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import ParameterError, RunError
 from splatsoil.files import read_npz, write_npz
 from splatsoil.scene.light import Light
 from splatsoil.scene.render import Scene
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from splatsoil.arrays import FloatArray
 from splatsoil.measurement import Camera
 from splatsoil.scene import kernels
 from splatsoil.scene.light import encoded, linear
@@ -20,8 +21,6 @@ from splatsoil.scene.tool import eye_of
 from splatsoil.splats.steps import Steps, stepwise
 from splatsoil.splats.views import Seen, rasterise_views
 from splatsoil.splats.warp_torch import launch, launch_parts, thread_count, upload
-
-FloatArray = npt.NDArray[np.float64]
 
 TOOL_OPACITY = 0.95
 """Of the discs that stand for the tool."""

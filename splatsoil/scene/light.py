@@ -21,10 +21,9 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import ParameterError
 from splatsoil.scene import kernels
-
-FloatArray = npt.NDArray[np.float64]
 
 SOIL_REFLECTANCE = 0.4
 """Reflectance of dry sand (0.35 to 0.45 in the visible), for interreflection.

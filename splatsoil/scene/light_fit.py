@@ -14,18 +14,17 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 import torch.nn.functional as functional
 from scipy.optimize import minimize
 from torch import Tensor
 
+from splatsoil.arrays import FloatArray
 from splatsoil.scene.light import SOIL_REFLECTANCE, Light, towards
 from splatsoil.scene.relief import Relief
 from splatsoil.scene.shading import normals, sky_visibility_of, sun_cosines, sun_visibility_at
 from splatsoil.splats.warp_torch import upload
 
-FloatArray = npt.NDArray[np.float64]
 Directions = Sequence[tuple[float, float]] | Sequence[FloatArray]
 """Azimuths and elevations, degrees."""
 

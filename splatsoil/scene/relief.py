@@ -19,12 +19,11 @@ import torch.nn.functional as functional
 import warp as wp
 from torch import Tensor
 
+from splatsoil.arrays import FloatArray
 from splatsoil.scene import kernels_relief
 from splatsoil.scene.kernels_maps import Grid, Surface
 from splatsoil.splats.steps import Steps, finished, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, upload
-
-FloatArray = npt.NDArray[np.float64]
 
 SMOOTHING = 1.0
 """Standard deviation of the kernel in particle spacings. Less shows single particles, more rounds off trench and heaps,

@@ -14,6 +14,7 @@ import torch.nn.functional as functional
 import warp as wp
 from torch import Tensor
 
+from splatsoil.arrays import FloatArray, Image
 from splatsoil.batches import in_batches
 from splatsoil.measurement import Bed, Camera
 from splatsoil.scene import kernels, kernels_visible
@@ -28,8 +29,6 @@ from splatsoil.splats import Gaussians
 from splatsoil.splats.steps import Steps, finished, together
 from splatsoil.splats.warp_torch import as_warp, launch, upload
 
-FloatArray = npt.NDArray[np.float64]
-FloatImage = npt.NDArray[np.float32]
 Pose = tuple[npt.ArrayLike, npt.ArrayLike]
 
 PARTICLE_SIZE, PARTICLE_THICKNESS = 0.4, 0.2
@@ -241,22 +240,22 @@ class Scene:
         """Steps of the layers of views of one size."""
         return layers_of.steps(views, self.background, self.tool_albedo)
 
-    def render(self, positions: Any, deformations: Any, tool: Pose | None, camera: Camera) -> FloatImage:
+    def render(self, positions: Any, deformations: Any, tool: Pose | None, camera: Camera) -> Image:
         """The picture (h, w, 3) float32 sRGB in [0, 1] that an undistorted camera takes of particles and tool."""
         return self.picture(self.pose(positions, deformations, tool), camera)
 
-    def picture(self, posed: Posed, camera: Camera) -> FloatImage:
+    def picture(self, posed: Posed, camera: Camera) -> Image:
         """The picture (h, w, 3) float32 sRGB in [0, 1] of a posed scene; several cameras may share the posing."""
         return self.pictures([(posed, camera)])[0]
 
-    def pictures(self, views: Iterable[tuple[Posed, Camera]]) -> list[FloatImage]:
+    def pictures(self, views: Iterable[tuple[Posed, Camera]]) -> list[Image]:
         """The `picture` of each posed scene by its camera."""
         seen = list(views)
         sizes: dict[tuple[int, int], list[int]] = {}
         for k, (_, camera) in enumerate(seen):
             sizes.setdefault((camera.height, camera.width), []).append(k)
         most = _AT_ONCE if self.device.type == "cuda" else 1
-        out: dict[int, FloatImage] = {}
+        out: dict[int, Image] = {}
         with torch.no_grad():
             for alike in sizes.values():
                 for first in range(0, len(alike), most):
@@ -265,7 +264,7 @@ class Scene:
                     out |= zip(some, images, strict=True)
         return [out[k] for k in range(len(seen))]
 
-    def _images(self, views: Sequence[tuple[Posed, Camera]]) -> list[FloatImage]:
+    def _images(self, views: Sequence[tuple[Posed, Camera]]) -> list[Image]:
         """Pictures of one size, drawn beside each other."""
         return list(finished(self._layering(views)).image.cpu().numpy().astype(np.float32))
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 import torch
 import torch.nn.functional as functional
@@ -20,8 +19,6 @@ from splatsoil.scene.light import Light
 from splatsoil.scene.relief import Relief
 from splatsoil.splats.steps import Steps, stepwise
 from splatsoil.splats.warp_torch import as_warp, launch, upload
-
-FloatArray = npt.NDArray[np.float64]
 
 _COARSE = 2
 """Cells of the interreflection, in cells of the relief."""

@@ -15,13 +15,13 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.soil.kernels_element import OUTPUTS, element_kernel
 from splatsoil.soil.law import Law
 from splatsoil.soil.matching import Matching
 from splatsoil.soil.settings import FRICTION_ANGLE, Settings
 
-FloatArray = npt.NDArray[np.float64]
 Values = Mapping[str, float] | Sequence[Mapping[str, float]]
 
 TOLERANCE = 1.0e-5

@@ -6,12 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from splatsoil.arrays import FloatArray
 from splatsoil.measurement import Bed
 from splatsoil.synthetic.stage import Light
-
-FloatArray = npt.NDArray[np.float64]
 
 AZIMUTHS = (0.0, 360.0)
 ELEVATIONS = (35.0, 60.0)

@@ -11,15 +11,14 @@ import numpy.typing as npt
 import trimesh
 import warp as wp
 
+from splatsoil.arrays import FloatArray, Image
 from splatsoil.measurement import HEAP, OPEN, TRANSPARENT, Camera, HeightMaps, Picture
 from splatsoil.mpm import Trajectory
 from splatsoil.observation import Observation
 from splatsoil.synthetic.appearance import Appearance
 from splatsoil.synthetic.setups import Setup
 from splatsoil.synthetic.soil_surface import soil_surface
-from splatsoil.synthetic.stage import Body, FloatImage, Stage, photograph
-
-FloatArray = npt.NDArray[np.float64]
+from splatsoil.synthetic.stage import Body, Stage, photograph
 
 NOISE = 1.5 / 255.0
 """Standard deviation of the sensor's noise, sRGB."""
@@ -41,7 +40,7 @@ _FAR = wp.constant(100.0)
 class Renderer(Protocol):
     """What pictures of a stage are taken with: takes `Stage`'s arguments, and has its `Stage.radiance`."""
 
-    def radiance(self, camera: Camera, *, seed: int = 0, side: int = 4) -> FloatImage: ...
+    def radiance(self, camera: Camera, *, seed: int = 0, side: int = 4) -> Image: ...
 
 
 @dataclass
@@ -171,7 +170,7 @@ class Recorder:
         and so measures all of both."""
         return (*self.setup.pre_roll, frame) if frame == self.setup.frames[0] else (frame,)
 
-    def _light(self, stage: Renderer, camera: Camera, which: int, number: int) -> FloatImage:
+    def _light(self, stage: Renderer, camera: Camera, which: int, number: int) -> Image:
         paths = self._generator(4, which, number).integers(2**31)
         image = stage.radiance(camera, seed=int(paths), side=PATHS)
         self._done += 1
@@ -180,7 +179,7 @@ class Recorder:
         self.progress(self._done / total)
         return image
 
-    def _expose(self, light: FloatImage, which: int, number: int) -> npt.NDArray[np.uint8]:
+    def _expose(self, light: Image, which: int, number: int) -> npt.NDArray[np.uint8]:
         return photograph(light, NOISE, self._generator(5, which, number))
 
     def _generator(self, use: int, which: int, number: int) -> np.random.Generator:

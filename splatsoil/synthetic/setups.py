@@ -11,11 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import BIN, HEAP, TRANSPARENT, Bed, Camera, Frame, Measurement, Tool, ToolMotion
 from splatsoil.reconstruction.height_field import HeightField
-
-FloatArray = npt.NDArray[np.float64]
 
 PRE_ROLL = (-4, -3, -2, -1)
 VIDEO_EVERY = 10

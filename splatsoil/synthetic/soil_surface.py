@@ -8,11 +8,10 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import SimulationError
 from splatsoil.measurement import Bed
 from splatsoil.synthetic.stage import Body
-
-FloatArray = npt.NDArray[np.float64]
 
 LEVEL = 0.5
 """The surface is where the blurred filling falls to this share of the bulk's: half, so that level soil ends where its

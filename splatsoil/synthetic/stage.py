@@ -14,14 +14,12 @@ import numpy.typing as npt
 import trimesh
 import warp as wp
 
+from splatsoil.arrays import FloatArray, Image
 from splatsoil.colour import encoded
 from splatsoil.errors import ParameterError
 from splatsoil.measurement import Camera
 from splatsoil.splats.warp_torch import launch_parts, thread_count
 from splatsoil.synthetic import tracing
-
-FloatArray = npt.NDArray[np.float64]
-FloatImage = npt.NDArray[np.float32]
 
 SUN_RADIUS = 0.0047
 """Tangent of the sun's angular radius."""
@@ -140,7 +138,7 @@ class Stage:
         stage.pattern = pattern
         self._stage = stage
 
-    def radiance(self, camera: Camera, *, seed: int = 0, side: int = 4) -> FloatImage:
+    def radiance(self, camera: Camera, *, seed: int = 0, side: int = 4) -> Image:
         """What the camera sees, lens distortion and all: (height, width, 3), linear; black where no ray of it leads.
 
         Args:
@@ -169,7 +167,7 @@ class Stage:
         return image
 
 
-def photograph(radiance: FloatImage, noise: float, generator: np.random.Generator) -> npt.NDArray[np.uint8]:
+def photograph(radiance: Image, noise: float, generator: np.random.Generator) -> npt.NDArray[np.uint8]:
     """What a sensor makes of linear radiance: (h, w, 3) sRGB, uint8, with Gaussian noise of ``noise`` in [0, 1]."""
     clipped = np.clip(radiance.astype(np.float64), 0.0, 1.0)
     noisy = encoded(clipped) + noise * generator.standard_normal(clipped.shape)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import warp as wp
 
 from splatsoil import __version__
@@ -27,7 +26,6 @@ from splatsoil.synthetic.appearance import Appearance
 from splatsoil.synthetic.recording import DEPTH_NOISE, GRID_NOISE, NOISE, Recorder
 from splatsoil.synthetic.setups import Setup
 
-FloatArray = npt.NDArray[np.float64]
 Report = Callable[[str, float], None]
 
 QUALITY = 96

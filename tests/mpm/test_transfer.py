@@ -272,7 +272,7 @@ def test_contact_acts_by_what_the_tool_covers(above: float) -> None:
     pose = Pose(np.array([0.094, 0.1, edge + 0.05]), UPRIGHT, np.zeros(3), np.zeros(3))
     run._pose.assign(pose.row().astype(np.float32))
     run._contact(1e-4, 1.0)
-    weight = run._near_weight.numpy()[:8].reshape(2, 2, 2).sum(axis=(0, 1))
+    weight = run._contacts.weight.numpy()[:8].reshape(2, 2, 2).sum(axis=(0, 1))
     high = 0.5 + above / cell
     low = (1.0 - high) * above / (above + 0.5 * cell)
     np.testing.assert_allclose(weight, np.array([low, high]) / (low + high), atol=0.06)
