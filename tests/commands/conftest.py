@@ -158,7 +158,7 @@ def program() -> Callable[..., Any]:
             preexec_fn=lambda: os.sched_setaffinity(0, mine),
         )
         assert done.returncode == code and "Traceback" not in done.stderr, done.stderr
-        told = json.loads(done.stdout)
-        return told if code == 0 else told["error"]
+        printed = json.loads(done.stdout)
+        return printed if code == 0 else printed["error"]
 
     return command

@@ -79,8 +79,8 @@ class Stages:
         """Of the latest fit, with errors of the model as it is and of the best effect."""
         before = self.run.fit()
         after = {name: "+".join(sorted([*before["setup"]["effects"], name])) for name in names if name}
-        told = {"": before["name"], **after}
-        held_out = [{"model": key, "error": ERRORS.get(fit, 4.0), "noise": 1.0} for key, fit in told.items()]
+        fits = {"": before["name"], **after}
+        held_out = [{"model": key, "error": ERRORS.get(fit, 4.0), "noise": 1.0} for key, fit in fits.items()]
         return {"held_out": held_out, "notes": ["it could not be simulated (soil left the bin)"]}
 
     def run_fit(self, options: FitOptions, *_: object) -> dict[str, Any]:

@@ -44,11 +44,11 @@ def test_no_command_tells_an_estimate_that_means_nothing(
     for in_json in (False, True):
         assert cli.main(words(command, run, *["--json"] * in_json)) == NoAnswer.code == 3
         out, err = capsys.readouterr()
-        told = json.loads(out) if in_json else {"ok": False, "error": out.splitlines()[0]}
-        assert told["ok"] is False and told["error"].startswith("no answer: ") and says in told["error"]
+        printed = json.loads(out) if in_json else {"ok": False, "error": out.splitlines()[0]}
+        assert printed["ok"] is False and printed["error"].startswith("no answer: ") and says in printed["error"]
         assert "Traceback" not in err
         assert not {"35", "35.1", "35.0"} & set(out.replace("°", " ").replace(",", " ").split()), out
-        assert not in_json or (told["run"], told["set"]) == (str(run.path), str(run.path.parent / "my set"))
+        assert not in_json or (printed["run"], printed["set"]) == (str(run.path), str(run.path.parent / "my set"))
 
 
 def test_what_is_an_answer(fit_of: Callable[..., dict[str, Any]]) -> None:
@@ -72,5 +72,5 @@ def test_json_names_run_and_set(
     results["run_fit"]["run"] = {"measurement": {"name": "plow"}}
     run.write_fit("base", results["run_fit"])
     assert cli.main(words(command, run, "--json")) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["run"], told["set"]) == (str(run.path), run.description["measurement"]["folder"])
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["run"], printed["set"]) == (str(run.path), run.description["measurement"]["folder"])

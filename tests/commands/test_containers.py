@@ -25,10 +25,10 @@ def test_each_container_is_reconstructed_fitted_compared_and_diagnosed(
     words = ["run", str(tmp_path / "set"), "--run", str(run), "--preset", "tiny", "--no-effects", "--json"]
     assert main(words) in (0, 3) and json.loads(capsys.readouterr().out)
     assert main(["diagnose", str(run), "--effects", "cohesion", "--json"]) in (0, 3)
-    told = json.loads(capsys.readouterr().out)
-    assert told["ok"] and (run / "diagnosis.json").is_file()
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["ok"] and (run / "diagnosis.json").is_file()
     if container == "transparent":  # whose sides are seen: nothing is missing in a world of our own solver
-        assert told["verdict"] == "adequate"
+        assert printed["verdict"] == "adequate"
     made = json.loads((run / "reconstruction" / "reconstruction.json").read_text())
     assert made["container"] == container
     off = Reconstruction.load(run / "reconstruction").surface.difference(setup.surface)

@@ -20,13 +20,13 @@ def test_the_triaxial_test_as_json_with_a_plot(tmp_path: Path, capsys: pytest.Ca
     plot = tmp_path / "curve.png"
     words = ["element", "--friction-angle", "30", "--with", "dilatancy", "--set", "dilatancy_angle=10", "--json"]
     assert cli.main([*words, "--plot", str(plot), "--strain", "0.1"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    records = told["records"]
+    printed = json.loads(capsys.readouterr().out)
+    records = printed["records"]
     assert records["q [Pa]"][-1] == pytest.approx(2e5, rel=1e-3)
     assert len(records["axial strain"]) == 101
     assert records["void ratio"][-1] == pytest.approx(1.8 * math.exp(-records["volume strain"][-1]) - 1.0)
     assert records["volume strain"][-1] < -0.01
-    assert told["parameters"]["dilatancy_angle"] == 10.0
+    assert printed["parameters"]["dilatancy_angle"] == 10.0
     assert plot.read_bytes().startswith(b"\x89PNG")
 
 

@@ -109,13 +109,13 @@ def helpers(process: subprocess.Popen[str]) -> list[int]:
 def test_a_fit_killed_while_it_writes_comes_to_the_same_end(place: Path) -> None:
     """Twice: at the file that describes the run, and later."""
     words = ("fit", *QUICK)
-    told, touched = finish(place, words, run="quick")
+    printed, touched = finish(place, words, run="quick")
     for moment in (3, random.Random(0).randrange(8, touched)):
         process = start(place, words, run="quick-killed", moment=moment)
         _, err = process.communicate(timeout=600)
         assert process.returncode == -signal.SIGKILL, err
     again, _ = finish(place, words, run="quick-killed")
-    assert timeless(again) | {"run": ""} == timeless(told) | {"run": ""}
+    assert timeless(again) | {"run": ""} == timeless(printed) | {"run": ""}
     whole, killed = essence(place / "quick"), essence(place / "quick-killed")
     assert without_places(killed) == without_places(whole)
 

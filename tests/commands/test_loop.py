@@ -65,9 +65,9 @@ def test_run_compares_all_effects_unless_told_to_stop(
     missing: dict[str, Any], capsys: pytest.CaptureFixture[str], flags: list[str], looks: bool
 ) -> None:
     assert cli.main(["run", "set", "--json", *flags]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told.get("stopped") == "enough") is looks and ("diagnosis" in told) is looks
-    assert ("misfit" in told) is not looks
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed.get("stopped") == "enough") is looks and ("diagnosis" in printed) is looks
+    assert ("misfit" in printed) is not looks
 
 
 @pytest.mark.parametrize(("fails", "flags"), [("add_missing", []), ("check_adequacy", ["--no-effects"])])
@@ -78,5 +78,5 @@ def test_what_fails_after_the_fit_costs_no_report(
     assert cli.main(["run", "set", "--json", *flags]) == 0
     out, err = capsys.readouterr()
     assert "whether the model is adequate isn't known: soil left the bin" in err
-    told = json.loads(out)
-    assert told["name"] == "base" and "misfit" not in told and "diagnosis" not in told
+    printed = json.loads(out)
+    assert printed["name"] == "base" and "misfit" not in printed and "diagnosis" not in printed

@@ -51,7 +51,7 @@ def test_a_set_elsewhere_is_asked_for_and_then_known(
     assert f"`splatsoil report {run} --set FOLDER` notes where it is now" in refused(command, run)
     assert "far enough" in refused(command, run, "--set", new)
     assert "far enough" in refused(command, run)
-    assert reaches == [new, new], "once told, it is known"
+    assert reaches == [new, new], "once given, it is stored"
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -84,10 +84,10 @@ def test_a_fit_takes_the_new_place(project: Path, refused: Refused) -> None:
     assert _model.measurement_of(RunFolder.open(run)).folder == new
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_another_set_is_not_taken(project: Path, refused: Refused, told: bool) -> None:
+@pytest.mark.parametrize("given", [True, False])
+def test_another_set_is_not_taken(project: Path, refused: Refused, given: bool) -> None:
     run, place = project / "runs" / "run", project / "data" / "set"
     before = (run / "run.json").read_bytes()
     (place / "experiment.json").write_text((place / "experiment.json").read_text().replace("1600", "1700"))
-    assert "has changed since" in refused("compare", run, *(["--set", place] if told else []))
+    assert "has changed since" in refused("compare", run, *(["--set", place] if given else []))
     assert (run / "run.json").read_bytes() == before

@@ -53,10 +53,10 @@ def test_what_ctrl_c_says_can_be_pasted(name: str) -> None:
     as_usual = [f.name for f in dataclasses.fields(config) if getattr(config, f.name) == f.default]
     assert as_usual == (["name", "arguments"] if name == "benchmark" else [])
     places = [f for f in dataclasses.fields(config) if f.default is dataclasses.MISSING]
-    for told in (config, parse(name, command.Config, given[: len(places)])):
-        hint = cli.after_interrupt(name, command, told)
+    for each in (config, parse(name, command.Config, given[: len(places)])):
+        hint = cli.after_interrupt(name, command, each)
         again = shlex.split(hint[hint.index("splatsoil ") :])
-        assert again[:2] == ["splatsoil", name] and parse(name, command.Config, again[2:]) == told
+        assert again[:2] == ["splatsoil", name] and parse(name, command.Config, again[2:]) == each
 
 
 def test_a_command_line_leaves_out_what_is_as_usual() -> None:

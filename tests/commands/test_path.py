@@ -48,8 +48,8 @@ def place(plow_dry: Path, cut: Callable[..., Path], tmp_path_factory: pytest.Tem
 @pytest.fixture(scope="module")
 def whole(place: Path, program: Program) -> dict[str, Any]:
     """``splatsoil run`` from nothing."""
-    told: dict[str, Any] = program("run", "set", *QUICK, "--run", "whole", "--no-effects", cwd=place)
-    return told
+    printed: dict[str, Any] = program("run", "set", *QUICK, "--run", "whole", "--no-effects", cwd=place)
+    return printed
 
 
 @pytest.mark.slow
@@ -67,9 +67,9 @@ def test_one_command_leads_from_photographs_to_the_report(place: Path, whole: di
     assert comparison["noise"]["robust"] > 0.0
     misfit = read_json(run / "comparison" / "misfit.json")
     assert misfit["adequate"] is whole["misfit"]["adequate"] and misfit["checks"] == whole["misfit"]["checks"]
-    told = misfit["estimates"]["friction_angle"]
-    assert whole["misfit"]["estimates"]["friction_angle"] == told, "one answer"
-    assert (told["value"], told["std"]) == (angle["estimate"], angle["std"])
+    printed = misfit["estimates"]["friction_angle"]
+    assert whole["misfit"]["estimates"]["friction_angle"] == printed, "one answer"
+    assert (printed["value"], printed["std"]) == (angle["estimate"], angle["std"])
     assert len(list((run / "features").glob("*.npy"))) == misfit["simulations"], "each is kept"
     page = (run / "report.html").read_text()
     assert "friction angle" in page and misfit_verdict(misfit) in page
@@ -132,8 +132,8 @@ def test_compare_and_report_work_on_a_finished_run(
     again = read_json(run / "comparison" / "comparison.json")
     assert again | {"seconds": 0} == before | {"seconds": 0}
     assert cli.main(["report", str(run), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["ok"], told["report"]) == (True, str(run / "report.html"))
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["ok"], printed["report"]) == (True, str(run / "report.html"))
     assert (run / "report.html").is_file()
 
 
@@ -153,18 +153,18 @@ def test_a_run_folder_is_for_one_set_preset_and_seed(
 def test_a_fit_and_its_posterior(place: Path, whole: dict[str, Any], program: Program) -> None:
     fitted = whole["parameters"]["friction_angle"]
     shutil.copytree(place / "whole", place / "sampled")
-    told = program("posterior", "sampled", "--checks", "1", cwd=place)
-    angle = told["parameters"]["friction_angle"]
-    assert len(told["checks"]) == 1
+    printed = program("posterior", "sampled", "--checks", "1", cwd=place)
+    angle = printed["parameters"]["friction_angle"]
+    assert len(printed["checks"]) == 1
     assert angle["mean"] == pytest.approx(fitted["estimate"], abs=0.15 * fitted["std"])
     assert angle["std"] == pytest.approx(fitted["std"], rel=0.15)
     assert 20.0 <= angle["low"] <= angle["median"] <= angle["high"] <= 50.0
     assert angle["verdict"] in ("determined", "weakly determined", "not determined")
-    assert told["figures"] == ["corner.png"]
+    assert printed["figures"] == ["corner.png"]
     assert (place / "sampled" / "posterior" / "posterior.nc").is_file()
     kept = {file.name: file.stat().st_mtime_ns for file in (place / "sampled" / "features").glob("*.npy")}
     again = program("posterior", "sampled", "--checks", "1", cwd=place)
-    assert again["parameters"] == told["parameters"]
+    assert again["parameters"] == printed["parameters"]
     assert {file.name: file.stat().st_mtime_ns for file in (place / "sampled" / "features").glob("*.npy")} == kept
     fit = read_json(place / "sampled" / "fit.json")
     fit["setup"]["code"] = "other"

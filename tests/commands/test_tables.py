@@ -91,7 +91,7 @@ def test_the_hint_after_a_fit_can_be_pasted(
     assert cli.main(["fit", "set"]) == 0
     text = text_of(capsys)
     assert "friction_angle 35.0 ± 0.8° 33.4 to 36.5° note [red]one[/red] loss 0.123 ± 0.01" in text
-    assert text.endswith(f"and where? splatsoil compare '{run.path}'")
+    assert text.endswith(f"and where does it fail? splatsoil compare '{run.path}'")
 
 
 def progress(quiet: bool = False) -> None:

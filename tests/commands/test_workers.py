@@ -114,11 +114,11 @@ def test_who_is_not_alone_in_a_folder_has_no_workers(stage: str, monkeypatch: py
     model: Any = SimpleNamespace(device="cpu")
     monkeypatch.setattr(_stages, "experiment_of", lambda *words: (SimpleNamespace(), SimpleNamespace()))
 
-    def told(*words: Any) -> Any:
+    def report(*words: Any) -> Any:
         return lambda *words: None
 
     with pytest.raises(RunError, match="another process"):
-        getattr(_stages, stage)(folder, model, told)
+        getattr(_stages, stage)(folder, model, report)
     assert not made
 
 

@@ -198,12 +198,12 @@ def test_a_set_without_pictures_goes_the_whole_path(
 ) -> None:
     run = tmp_path / "run"
     assert main(["run", str(scanned), "--run", str(run), "--preset", "tiny", "--no-effects", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    angle = told["parameters"]["friction_angle"]
+    printed = json.loads(capsys.readouterr().out)
+    angle = printed["parameters"]["friction_angle"]
     assert abs(angle["estimate"] - 33.0) < 2.0 * angle["std"] + 1.0
     assert main(["diagnose", str(run), "--effects", "cohesion", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["ok"]
-    told = re.sub(r"<(style|script|svg).*?</\1>|<[^>]+>", " ", (run / "report.html").read_text(), flags=re.DOTALL)
-    assert CHANNEL in told and not re.search("photograph|camera|video|Gaussians", told)
+    printed = re.sub(r"<(style|script|svg).*?</\1>|<[^>]+>", " ", (run / "report.html").read_text(), flags=re.DOTALL)
+    assert CHANNEL in printed and not re.search("photograph|camera|video|Gaussians", printed)
     assert main(["export", str(run), "--to", "csv", "ply"]) == 0
     assert {p.name for p in (run / "export").iterdir()} == {"export.json", "csv"}

@@ -42,13 +42,13 @@ def test_a_linear_model_has_its_closed_form(posterior: Posterior) -> None:
 
 
 def test_what_no_feature_depends_on_is_said_to_be_undetermined(posterior: Posterior) -> None:
-    told = summarise(posterior, list(SPACE))
-    angle, cohesion = told["parameters"]["friction_angle"], told["parameters"]["cohesion"]
+    result = summarise(posterior, list(SPACE))
+    angle, cohesion = result["parameters"]["friction_angle"], result["parameters"]["cohesion"]
     assert angle["verdict"] == "determined" and angle["contraction"] < 0.3
     assert cohesion["verdict"] == "not determined" and cohesion["contraction"] > 0.9
-    assert any("cohesion is not determined" in note for note in told["notes"])
+    assert any("cohesion is not determined" in note for note in result["notes"])
     assert angle["low"] < angle["low_50"] < angle["median"] < angle["high_50"] < angle["high"]
-    assert told["chains"]["converged"]
+    assert result["chains"]["converged"]
     titles = [axis.get_title() for axis in corner_figure(posterior, list(SPACE)).axes if axis.get_title()]
     assert len(titles) == 2 and titles[1] == "cohesion: not identified"
     assert titles[0].startswith("friction angle: ") and " to " in titles[0]
@@ -62,6 +62,6 @@ def test_there_is_nothing_outside_of_the_bounds() -> None:
 
 def test_a_posterior_that_crowds_at_a_bound_says_so() -> None:
     density = line(truth=(1.1, 0.0))
-    told = summarise(Posterior(density, sample(density, 2)), list(SPACE))
-    assert told["parameters"]["friction_angle"]["at_bound"] == ["upper"]
-    assert any("crowds at its upper bound" in note for note in told["notes"])
+    result = summarise(Posterior(density, sample(density, 2)), list(SPACE))
+    assert result["parameters"]["friction_angle"]["at_bound"] == ["upper"]
+    assert any("crowds at its upper bound" in note for note in result["notes"])

@@ -17,7 +17,7 @@ ANGLE = Parameter("friction_angle", "deg", 20.0, 50.0, 35.0)
 Make = Callable[..., EmulatedExperiment]
 
 
-def waves(seed: int, layout: Layout) -> np.ndarray:
+def smooth_field(seed: int, layout: Layout) -> np.ndarray:
     """(t, s) a smooth pattern of unit size, another one for each seed."""
     rng = np.random.default_rng([seed, 5])
     t = np.arange(layout.shape[0])[:, None] / layout.shape[0]
@@ -37,10 +37,10 @@ def candidate(name: str, sign: int = 1, kind: str = "physics") -> Candidate:
     return Candidate(name, "observation" if kind == "observation" else "physics", (size,), size.name)
 
 
-@pytest.fixture(scope="session", name="waves")
-def _waves() -> Callable[[int, Layout], np.ndarray]:
+@pytest.fixture(scope="session", name="smooth_field")
+def _smooth_field() -> Callable[[int, Layout], np.ndarray]:
     """Smooth patterns of unit size."""
-    return waves
+    return smooth_field
 
 
 @pytest.fixture(scope="session", name="candidate")
@@ -82,25 +82,25 @@ def make() -> Make:
         root = 1.0 * np.eye(shape[0] * shape[1])
         experiment = EmulatedExperiment(
             layout,
-            8.0 * waves(1, layout),
+            8.0 * smooth_field(1, layout),
             {"friction_angle": 35.0},
             {
-                "friction_angle": 0.8 * waves(2, layout),
-                **{f"{n}_size": 1.5 * waves(10 + i, layout) for i, n in enumerate(names)},
+                "friction_angle": 0.8 * smooth_field(2, layout),
+                **{f"{n}_size": 1.5 * smooth_field(10 + i, layout) for i, n in enumerate(names)},
             },
             (ANGLE,),
             candidates,
             root,
             np.full(shape, 0.5),
             np.zeros(shape),
-            curves={"friction_angle": 0.02 * waves(3, layout)},
-            patterns={"fine": discretisation * waves(4, layout)},
-            albedo_patterns={"guess 1": 0.3 * waves(6, layout), "guess 2": 0.3 * rng.normal(size=shape)},
+            curves={"friction_angle": 0.02 * smooth_field(3, layout)},
+            patterns={"fine": discretisation * smooth_field(4, layout)},
+            albedo_patterns={"guess 1": 0.3 * smooth_field(6, layout), "guess 2": 0.3 * rng.normal(size=shape)},
         )
         values = {"friction_angle": 33.0, **(truth or {})}
         observed = experiment.measured(values, [1000 + seed], extra)
         # Nature is the fine one, and as far from it again.
-        observed = observed + experiment.patterns["fine"] + discretisation * waves(100 + seed, layout)
+        observed = observed + experiment.patterns["fine"] + discretisation * smooth_field(100 + seed, layout)
         return EmulatedExperiment(**{**vars(experiment), "observed": observed})
 
     return made

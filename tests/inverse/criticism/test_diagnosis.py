@@ -16,13 +16,13 @@ from splatsoil.experiment.emulated import EmulatedExperiment
 from splatsoil.files import plain
 
 Make = Callable[..., EmulatedExperiment]
-WORLDS = range(6)
+SEEDS = range(6)
 START = {"friction_angle": 35.0}
 
 
 def test_nothing_hidden_is_not_named_and_the_angle_is_covered(make: Make) -> None:
     z, named = [], 0
-    for seed in WORLDS:
+    for seed in SEEDS:
         found = diagnose(make(seed=seed), START, seed=seed)
         value, std = found.estimates["friction_angle"]
         z.append((value - 33.0) / std)
@@ -49,8 +49,8 @@ def test_an_effect_that_is_hidden_is_named_with_its_size_and_takes_the_error_awa
     assert after.log_score > before.log_score
 
 
-def test_a_pattern_that_no_effect_has_is_not_given_a_name(make: Make, waves: Callable[..., np.ndarray]) -> None:
-    experiment = make(extra=8.0 * waves(50, make().layout))
+def test_a_pattern_that_no_effect_has_is_not_given_a_name(make: Make, smooth_field: Callable[..., np.ndarray]) -> None:
+    experiment = make(extra=8.0 * smooth_field(50, make().layout))
     found = diagnose(experiment, START)
     assert found.verdict not in ("missing", "one of", "adequate")
 
@@ -122,7 +122,7 @@ def test_what_is_set_aside_has_no_say_in_the_models_that_it_judges(make: Make) -
 def test_the_noise_holds_what_seeds_scatter_by(make: Make) -> None:
     """Of chance of unit size in every feature and of sensors of half of it, in scores of unit directions."""
     ratios, sizes = [], []
-    for seed in WORLDS:
+    for seed in SEEDS:
         experiment = make(discretisation=0.0, seed=seed)
         found = diagnose(experiment, START, effects=False, seed=seed)
         noise = found.evidence.noise

@@ -144,19 +144,19 @@ def test_the_chains_sample_what_the_comparison_integrates(make: Make, tmp_path: 
     angles = prior.space.from_unit(grid[:, None])[:, 0]
     mean = float(weight @ angles)
     std = float(np.sqrt(weight @ (angles - mean) ** 2))
-    told = run_posterior(run, experiment, simulate, density, checks=2)
-    angle, fitted_angle = told["parameters"]["friction_angle"], result["parameters"]["friction_angle"]
+    sampled = run_posterior(run, experiment, simulate, density, checks=2)
+    angle, fitted_angle = sampled["parameters"]["friction_angle"], result["parameters"]["friction_angle"]
     assert angle["mean"] == pytest.approx(mean, abs=0.1 * std) and angle["std"] == pytest.approx(std, rel=0.1)
     assert fitted_angle["estimate"] == pytest.approx(mean, abs=0.1 * std)
     assert fitted_angle["std"] == pytest.approx(std, rel=0.1)
     for end in ("low", "high"):
         assert fitted_angle[end] == pytest.approx(angle[end], abs=0.15 * std)
-    assert angle["verdict"] == "determined" and told["chains"]["converged"]
-    assert len(told["checks"]) == 2 and np.mean([c["chi2"] for c in told["checks"]]) < 4.0
-    for name in ("posterior.nc", *told["figures"]):
+    assert angle["verdict"] == "determined" and sampled["chains"]["converged"]
+    assert len(sampled["checks"]) == 2 and np.mean([c["chi2"] for c in sampled["checks"]]) < 4.0
+    for name in ("posterior.nc", *sampled["figures"]):
         assert (tmp_path / "posterior" / name).stat().st_size > 1000
     again = run_posterior(run, experiment, simulate, density, checks=2)
-    assert again["parameters"] == told["parameters"]
+    assert again["parameters"] == sampled["parameters"]
     arviz = pytest.importorskip("arviz")
     drawn = arviz.from_netcdf(tmp_path / "posterior" / "posterior.nc").posterior["friction_angle"].to_numpy()
     assert drawn.shape[0] == 4 and drawn.mean() == pytest.approx(angle["mean"], abs=1e-6)

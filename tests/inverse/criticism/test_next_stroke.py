@@ -153,11 +153,11 @@ def test_the_experiment_in_which_an_effect_acts_tells_most(make: Callable[..., E
     }
     probability = {"": 0.6, "one": 0.4}
 
-    def told(scale: float) -> Information:
+    def informed(scale: float) -> Information:
         experiment = proposed(make({}), one_size=scale)
         return expected_information(experiment, draws, probability, Simulations(experiment))
 
-    none, usual, strong = told(0.0), told(1.0), told(3.0)
+    none, usual, strong = informed(0.0), informed(1.0), informed(3.0)
     assert none.mean < 0.05
     assert strong.exceeds(none) and strong.mean >= usual.mean
     assert strong.distinguished == [("", "one")]
