@@ -30,6 +30,7 @@ NEUTRAL = {
     "starting.py": "what Ctrl-C does while the package is being loaded",
     "deterministic.py": "the same numbers, always in the same order",
     "errors.py": "words",
+    "arrays.py": "names of types",
     "batches.py": "how many at once, each of which comes out the same",
     "files.py": "files, and the digest itself",
     "run_files.py": "what kept files are called, and must hold",
