@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from splatsoil.arrays import FloatArray
 from splatsoil.comparison import Comparator
-from splatsoil.export.replay import FloatArray, Floats, Moment
+from splatsoil.export.replay import Floats, Moment
 from splatsoil.export.splats import lit_gaussians
 from splatsoil.measurement import Camera, Frame, Measurement
 from splatsoil.model import Model

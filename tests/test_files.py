@@ -31,6 +31,7 @@ NEUTRAL = {
     "deterministic.py": "the same numbers, always in the same order",
     "arrays.py": "types",
     "errors.py": "words",
+    "arrays.py": "names of types",
     "batches.py": "how many at once, each of which comes out the same",
     "files.py": "files, and the digest itself",
     "run_files.py": "what kept files are called, and must hold",

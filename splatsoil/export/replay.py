@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from splatsoil.arrays import FloatArray
 from splatsoil.model import Model
 from splatsoil.mpm.simulate import base_settings, step_poses
 from splatsoil.mpm.solver import Solver
 from splatsoil.scene import Relief, relief_of_particles
 
-FloatArray = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
 
 

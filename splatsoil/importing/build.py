@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.importing.clock import WIDTH, ClockOffset, Footage, clock_offset, moving
 from splatsoil.importing.options import ImportOptions
@@ -33,8 +33,6 @@ from splatsoil.measurement.measurement import EXPERIMENT, FORMAT, FRAME_RATES, M
 from splatsoil.measurement.motion import MOTION_COLUMNS, ToolMotion
 from splatsoil.measurement.tool import FORCE_COLUMNS, read_mesh
 from splatsoil.measurement.writer import Picture, whole_folder, write_frames, write_json, write_table
-
-FloatArray = npt.NDArray[np.float64]
 
 PRE_ROLL = 8
 """Frames before anything moves that are kept of a video, at most: they measure the noise."""

@@ -18,12 +18,11 @@ import numpy.typing as npt
 import trimesh
 from scipy.ndimage import map_coordinates
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement.camera import Camera
 from splatsoil.measurement.motion import ToolMotion
 from splatsoil.reconstruction.views import surface_points
-
-FloatArray = npt.NDArray[np.float64]
 
 WIDTH = 480
 """Pictures are halved until they are no wider, px."""

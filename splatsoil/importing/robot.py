@@ -6,16 +6,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement.fields import read_table
 from splatsoil.measurement.motion import ToolMotion, check_clock, rigid
 from splatsoil.measurement.tool import FORCE_COLUMNS
-
-FloatArray = npt.NDArray[np.float64]
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Metres in each unit of length."""

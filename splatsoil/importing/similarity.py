@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError
 from splatsoil.importing.source import find_image
 from splatsoil.measurement.fields import read_labelled, read_text
 from splatsoil.measurement.frames import Frame
 
-FloatArray = npt.NDArray[np.float64]
 Marks = dict[str, list[tuple[Frame, FloatArray]]]
 """Photographs, and pixels (2,) in them, by point."""
 

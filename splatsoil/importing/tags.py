@@ -13,6 +13,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import f as f_distribution
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.importing.similarity import Marked, Marks, intersected
 from splatsoil.importing.video import Video
@@ -20,8 +21,6 @@ from splatsoil.measurement.camera import Camera
 from splatsoil.measurement.fields import read_labelled
 from splatsoil.measurement.frames import Frame
 from splatsoil.measurement.motion import ToolMotion
-
-FloatArray = npt.NDArray[np.float64]
 
 FAMILY = "tag36h11"
 ALIKE = 0.1

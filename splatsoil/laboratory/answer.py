@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import SimulationError
 from splatsoil.experiment.base import Run
-from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment
+from splatsoil.experiment.laboratory import LaboratoryExperiment
 from splatsoil.inverse.criticism.design import Prior
 from splatsoil.inverse.criticism.diagnosis import diagnose
 from splatsoil.inverse.criticism.record import record

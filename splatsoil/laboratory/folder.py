@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.experiment.base import Run
 from splatsoil.experiment.column import Collapse, ColumnExperiment
-from splatsoil.experiment.laboratory import FloatArray, LaboratoryExperiment, Specimen
+from splatsoil.experiment.laboratory import LaboratoryExperiment, Specimen
 from splatsoil.experiment.plate import GRAVITY, Loading, PlateExperiment
 from splatsoil.experiment.shear_box import ReposeExperiment, ShearBoxExperiment
 from splatsoil.experiment.triaxial import TriaxialExperiment

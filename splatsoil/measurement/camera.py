@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from splatsoil.arrays import FloatArray
 
 FISHEYE = "OPENCV_FISHEYE"
 CAMERA_MODELS = ("OPENCV", "PINHOLE", FISHEYE)

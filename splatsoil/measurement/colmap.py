@@ -17,13 +17,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement.camera import LENSES, Camera
 from splatsoil.measurement.fields import inside, read_text
 from splatsoil.measurement.frames import Frame
 from splatsoil.measurement.images import check_image
 
-FloatArray = npt.NDArray[np.float64]
 Number = TypeVar("Number", int, float)
 
 # COLMAP's models by number, and how many parameters each has: what is not read is skipped where no image uses it.

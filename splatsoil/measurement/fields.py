@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError
 
-FloatArray = npt.NDArray[np.float64]
 Value = TypeVar("Value")
 
 _ALIKE = 0.8  # difflib's ratio of two words one of which is the other misspelt: a letter of five, two of ten

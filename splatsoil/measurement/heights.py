@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement.fields import Fields
 from splatsoil.measurement.frames import Frame
 from splatsoil.measurement.images import read_numbers
-
-FloatArray = npt.NDArray[np.float64]
 
 FIELDS = ("corner", "cell", "noise", "frames")
 FRAME_FIELDS = ("file_path", "frame")

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError
 from splatsoil.files import check_paths
 from splatsoil.measurement.camera import Camera
@@ -19,8 +20,6 @@ from splatsoil.measurement.frames import Frame, read_transforms
 from splatsoil.measurement.heights import HeightMaps, depth_points
 from splatsoil.measurement.motion import ToolMotion
 from splatsoil.measurement.tool import DEFAULT_FRICTION, Tool, read_force, read_mesh
-
-FloatArray = npt.NDArray[np.float64]
 
 FORMAT = "splatsoil-measurement/1"
 EXPERIMENT = "experiment.json"

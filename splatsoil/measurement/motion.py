@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement.fields import read_table
 
-FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 MOTION_COLUMNS = ("frame", "time", "x", "y", "z", "qw", "qx", "qy", "qz")

@@ -11,12 +11,11 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
+from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError
 from splatsoil.files import check_unpacked
 from splatsoil.measurement.fields import read_table
 from splatsoil.measurement.motion import ToolMotion, check_clock
-
-FloatArray = npt.NDArray[np.float64]
 
 #: Types of mesh, by their suffix. Others run readers that follow paths, or unpack whatever is in an archive.
 FORMATS = ("stl", "obj", "ply", "off", "glb", "gltf", "3mf")

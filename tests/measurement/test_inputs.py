@@ -13,10 +13,6 @@ from PIL import Image
 from splatsoil.errors import MeasurementError
 from splatsoil.measurement import Camera, Frame, ToolMotion
 from splatsoil.measurement import measurement as limits
-from splatsoil.measurement.camera import LENSES
-from splatsoil.measurement.colmap import _MODELS
-from splatsoil.measurement.fields import Fields
-from splatsoil.measurement.frames import read_camera
 from splatsoil.measurement.images import check_photograph
 from splatsoil.measurement.motion import MOTION_COLUMNS
 from splatsoil.measurement.remarks import _FORCES
@@ -154,14 +150,6 @@ def tables(folder: Path) -> Iterator[tuple[str, str]]:
         yield name, outcome(attempt)
 
 
-def lenses() -> Iterator[tuple[str, str]]:
-    for name, (model, parameters) in LENSES.items():
-        yield f"`{name}`", f"`{model}` of {', '.join(f'`{p}`' for p in parameters)}"
-    others = [name for name, _ in _MODELS if name not in LENSES]
-    unknown = Fields({"camera_model": others[0]}, Path("transforms.json"))
-    yield ", ".join(f"`{name}`" for name in others), outcome(lambda: read_camera(unknown, "").model)
-
-
 def sizes() -> Iterator[tuple[str, str]]:
     yield "an edge of the bed", f"{limits._SMALLEST_BED:g} to {limits._LARGEST_BED:g} m"
     yield "the bed's distance from the origin", f"to {limits._FARTHEST_BED:g} m"
@@ -195,7 +183,6 @@ def page() -> str:
         for title, rows in (
             ("Photographs and video frames", images(folder)),
             ("Depth", depths(folder)),
-            ("Lenses, by `camera_model` or COLMAP's names (`f` is both focal lengths)", lenses()),
             ("The tool's mesh", meshes(folder)),
             ("Motion and force", tables(folder)),
             ("Sizes and units", sizes()),
