@@ -1,4 +1,4 @@
-"""Hidden effects in synthetic experiments of an independent solver: does the whole chain name the right one?
+"""Synthetic experiments with a hidden effect, by an independent solver: does the whole chain name the right one?
 
 Each is one run of Newton's implicit MPM (extra ``independent``) with one thing that its measurement set does not state,
 or with nothing, photographed by the path tracer. ``splatsoil fit`` and ``diagnose`` then get the set alone. Truths are
