@@ -132,7 +132,8 @@ def wall_top(views: Views, bed: Bed, usable: torch.Tensor) -> float:
     """
     step = footprint(views, bed)
     edge, _ = around(bed.lower[:2] - step, bed.upper[:2] + step, 2.0 * step)
-    heights = np.arange(float(bed.lower[2]), max(float(views.positions[:, 2].min()), float(bed.upper[2])), step)
+    top = max(float(views.positions[:, 2].min()), float(bed.upper[2])) + 2.0 * step
+    heights = np.arange(float(bed.lower[2]), top, step)
     xy, z = (torch.tensor(a, dtype=torch.float32, device=views.images.device) for a in (edge, heights))
     places = functional.pad(xy.expand(len(z), -1, -1), (0, 2), value=1.0)
     places[..., 2] = z[:, None]

@@ -6,6 +6,7 @@ import torch
 
 from splatsoil.measurement import Camera
 from splatsoil.scene import Relief, ground_of_pixels
+from splatsoil.splats import Gaussians
 from splatsoil.synthetic.setups import look_at
 
 CELL = 0.01
@@ -99,6 +100,28 @@ def test_soil_outside_the_rectangle_hides_what_is_behind_it():
     assert stopped.sum() > 50 and free.sum() > 50
     assert not np.isfinite(hidden[stopped]).any()
     assert np.allclose(hidden[free], plain[free], atol=1e-5)
+
+
+def test_gaussians_before_the_bed_hide_it_and_those_behind_do_not():
+    """Upright walls of opaque Gaussians, one before the bed and a higher one behind it."""
+    height, spacing, level = 0.3, 0.01, 0.2
+    eye = camera((0.5, -0.6, 0.6))
+
+    def wall(y, top):
+        x, z = np.meshgrid(np.arange(-0.5, 1.5, spacing), np.arange(0.0, top, spacing) + 0.5 * spacing)
+        return np.stack([x, np.full_like(x, y), z], axis=-1).reshape(-1, 3)
+
+    means = torch.tensor(np.concatenate([wall(0.05, height), wall(0.95, 0.6)]), dtype=torch.float32)
+    walls = Gaussians.discs(means, spacing, spacing, 0.9, torch.zeros(len(means), 3))
+    plain = relief(lambda x, y: level + 0.0 * x)
+    bed, found = (ground_of_pixels(plain, eye, LOWER, UPPER, 0.0, around) for around in (None, walls))
+    origins, directions = rays(eye)
+    over = origins[:, 2] + (0.05 - origins[:, 1]) / directions[:, 1] * directions[:, 2] - height
+    seen, over = np.isfinite(bed[..., 0]), over.reshape(bed.shape[:2])
+    hidden, clear = seen & (over < 0.0), seen & (over > 3.0 * spacing)
+    assert hidden.sum() > 50 and clear.sum() > 50
+    assert not np.isfinite(found[hidden]).any()
+    assert np.array_equal(found[clear], bed[clear])
 
 
 def test_a_rough_plain_has_no_crests():
