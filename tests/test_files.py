@@ -29,7 +29,6 @@ NEUTRAL = {
     "_version.py": "the version, which each key has by itself",
     "starting.py": "what Ctrl-C does while the package is being loaded",
     "deterministic.py": "the same numbers, always in the same order",
-    "arrays.py": "types",
     "errors.py": "words",
     "arrays.py": "names of types",
     "batches.py": "how many at once, each of which comes out the same",
