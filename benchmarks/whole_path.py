@@ -94,7 +94,7 @@ def renderer(task: Namespace) -> Section:
         posed = scene.pose(truth.particles[frame], None, motion.pose(frame / measurement.frame_rate))
         for name, camera in measurement.cameras.items():
             images[name, frame] = scene.picture(posed, camera.undistorted())
-    comparator = Comparator(measurement, surface=made.surface, frames=frames)
+    comparator = Comparator(measurement, surface=made.surface, frames=frames, surroundings=made.standing)
     model, least = Model(measurement, made, preset=task.preset, device=task.device), comparator.compare(images)
     weak, strong = (
         comparator.compare(model.predict({"friction_angle": truth.values["friction_angle"] + by}, 0).images)

@@ -11,7 +11,7 @@ from splatsoil.commands._options import FitOptions
 from splatsoil.commands._output import print_result, stages
 from splatsoil.envs.devices import resolve_device
 from splatsoil.errors import MeasurementError, RunError
-from splatsoil.files import plain, write_json
+from splatsoil.files import check_folder, plain, write_json
 from splatsoil.quiet import hush
 from splatsoil.run_files import read_format
 
@@ -73,6 +73,7 @@ def _answered(
     hush()
     experiment = load(folder, Options(tuple(about["effects"]), candidates, about["preset"], device))
     run = run or Path("runs") / f"{folder.resolve().name}-{about['preset']}"
+    check_folder(run)
     began = time.perf_counter()
     with stages(quiet=config.json) as begin:
         report = begin("diagnose" if with_effects else "fit")

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import trimesh
+from PIL import Image
 
 from splatsoil.arrays import FloatArray
 from splatsoil.errors import ParameterError
@@ -97,9 +98,11 @@ class Setup:
         """The same with pictures larger or smaller by ``factor``.
 
         Raises:
-            ParameterError: the factor leaves no picture.
+            ParameterError: the factor leaves no picture, or one that image libraries refuse to read.
         """
         cameras = (*self.views, *self.video.values())
+        if factor * factor * max(c.width * c.height for c in cameras) > (Image.MAX_IMAGE_PIXELS or math.inf):
+            raise ParameterError(f"pictures {factor:g} times as large cannot be read again; give a smaller factor")
         if not (math.isfinite(factor) and factor > 0.0 and min(min(c.width, c.height) for c in cameras) * factor >= 8):
             raise ParameterError(f"pictures {factor:g} times as large are too small; give a larger factor")
         return replace(

@@ -153,6 +153,14 @@ def test_what_is_wrong_is_said_in_one_sentence_and_nothing_is_written(
     assert not (tmp_path / "run").exists()
 
 
+def test_a_result_is_never_written_into_the_test(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write(tmp_path / "set", TRIAXIAL, HEAD + curve(lambda s: 40.0 * s))
+    before = sorted(folder.iterdir())
+    assert main(["fit", str(folder), "--run", str(folder)]) == 2
+    assert "is a measurement set, which is not written to" in capsys.readouterr().err
+    assert sorted(folder.iterdir()) == before
+
+
 def test_undrained_tests_are_refused_by_word_and_by_their_pore_pressure(tmp_path: Path) -> None:
     rows = "".join(f"{s},{40 * s},0,{100 - 10 * s}\n" for s in range(6))
     folder = write(tmp_path / "set", TRIAXIAL, HEAD.strip() + ",p_kPa\n" + rows)

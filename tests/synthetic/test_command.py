@@ -56,6 +56,7 @@ def test_like_another_set_with_an_effect(small_set: Path, tmp_path: Path, capsys
         (["--seed", "-3"], "-3"),
         (["--picture-scale", "0"], "larger factor"),
         (["--picture-scale", "nan"], "larger factor"),
+        (["--picture-scale", "1e9"], "smaller factor"),
         (["--depth", "0.3"], "--depth"),
         (["--depth", "-1"], "--depth"),
         (["--device", "abacus"], "abacus"),
