@@ -129,7 +129,7 @@ def test_a_minimum_at_a_bound_and_a_flat_loss_are_said(analytic: ModuleType, tmp
     assert any("upper bound (50 deg)" in note for note in beyond["notes"])
     flat = fit(analytic.AnalyticProblem(constant=True), analytic.prepare(tmp_path / "b"), analytic.SETUP, budget=5)
     assert flat["parameters"]["friction_angle"]["determined"] is False
-    assert any("not determined" in note for note in flat["notes"])
+    assert any("do not determine" in note for note in flat["notes"])
     assert flat["parameters"]["friction_angle"]["std"] > 4.0
 
 
