@@ -20,11 +20,11 @@ from splatsoil.inverse.criticism.simulations import Simulations
 from splatsoil.parameters import ParameterSpace
 
 STARTS = (-0.5, -0.2, 0.1)
-"""Of the search, in halves of the parameters' ranges about their middles; simulations with chance begin at the last."""
-STEP, CHANCE_STEP = 2e-3, 0.1
-"""Of the search's differences, likewise: where simulations have chance, well above it."""
-MOST = 12
-"""Rounds of a search among simulations with chance."""
+"""Starting points of the search, in half-ranges of the parameters about their middles; with scatter, only the last."""
+STEP, SCATTER_STEP = 2e-3, 0.1
+"""Step of the search's finite differences in half-ranges; with scatter, large enough to exceed it."""
+MAX_EVALUATIONS = 12
+"""Of the search where simulations have seed-to-seed scatter."""
 FAR = 1e3
 """Residual, in standard deviations, of a simulation that could not be made."""
 
@@ -82,16 +82,16 @@ def search(
         runs.append(Run(values, seed=seed))
         return ((table - experiment.observed) / experiment.sensor).ravel()
 
-    chance = experiment.stochastic
+    scatter = experiment.stochastic
     found = [
         least_squares(
             residuals,
             np.full(len(space), start),
             bounds=(-1.0, 1.0),
-            diff_step=CHANCE_STEP if chance else STEP,
-            max_nfev=MOST if chance else None,
+            diff_step=SCATTER_STEP if scatter else STEP,
+            max_nfev=MAX_EVALUATIONS if scatter else None,
         )
-        for start in (STARTS[-1:] if chance else STARTS)
+        for start in (STARTS[-1:] if scatter else STARTS)
     ]
     best = min(found, key=lambda f: float(f.cost))
     # one run at each place, and few of them: an emulator wants places that differ
@@ -104,7 +104,7 @@ def _apart(runs: list[Run], space: ParameterSpace, best: FloatArray) -> list[Run
     unit = space.to_unit(np.array([[r.values[p.name] for p in space] for r in runs]))
     kept: list[int] = []
     for index in np.argsort(np.linalg.norm(unit - best, axis=1), kind="stable"):
-        if all(np.linalg.norm(unit[index] - unit[k]) > CHANCE_STEP / 2 for k in kept):
+        if all(np.linalg.norm(unit[index] - unit[k]) > SCATTER_STEP / 2 for k in kept):
             kept.append(int(index))
         if len(kept) >= 5 * (1 + len(space)):
             break

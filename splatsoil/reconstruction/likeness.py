@@ -37,12 +37,12 @@ class Likeness:
     def unrelated(self, fixed: int) -> BoolArray:
         """Which of the last ``fixed`` pictures are no more like the scene than any picture is upside down.
 
-        A rank test: of pictures that have nothing in common with the scene, one in v + 1 passes. It tells nothing where
-        one of the others does not pass.
+        A rank test: of pictures that have nothing in common with the scene, one in v + 1 passes. It has no result
+        where one of the others does not pass.
         """
-        chance = np.max(self.control, initial=-1.0, where=np.isfinite(self.control))
-        told = not np.any(self.correlation[:-fixed] <= chance)
-        return (self.correlation[-fixed:] <= chance) & told
+        by_chance = np.max(self.control, initial=-1.0, where=np.isfinite(self.control))
+        valid = not np.any(self.correlation[:-fixed] <= by_chance)
+        return (self.correlation[-fixed:] <= by_chance) & valid
 
 
 def likeness(
