@@ -254,8 +254,7 @@ def main(arguments: list[str] | None = None) -> int:
     if not 0.0 < options.times[0] <= options.times[1] < math.inf:
         raise ParameterError("--times: give two positive numbers, the smaller one first")
     hush()
-    numerics = {"voxel": Numerics.voxel, "iterations": Numerics.iterations}
-    decides = {name: getattr(options, name) for name in ("seed", "times", "preset", "solver")} | numerics
+    decides = {name: getattr(options, name) for name in ("seed", "times", "preset", "solver")} | asdict(Numerics())
     decides["code"] = sources(*OWN)
     keep_to_one_protocol(options.out, decides)
     truths = [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,12 +19,6 @@ SPACING, COARSE = 0.02, Numerics(voxel=0.04, substeps=2, iterations=60)
 
 def soil_of(scene: Scene, spacing: float) -> Soil:
     return Hidden(NOTHING, 0, scene).soil(scene.setup(), spacing)
-
-
-def test_the_examples_were_made_with_converged_numerics(plow_dry: Path, plow_damp: Path) -> None:
-    for folder in (plow_dry, plow_damp):
-        truth = json.loads((folder / "truth.json").read_text())
-        assert Numerics(truth["voxel"], truth["sub"], truth["iterations"]) == Numerics()
 
 
 def test_a_bed_weighs_what_its_soil_does() -> None:
