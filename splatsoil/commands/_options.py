@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
-from splatsoil.errors import ParameterError, did_you_mean
+from splatsoil.errors import ParameterError, SplatsoilError, did_you_mean
 from splatsoil.options import JSON, argument, option
 
 Preset = Literal["tiny", "small", "paper", "fine"]
@@ -126,6 +126,7 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """One line on stderr."""
         command = self.prog.removeprefix("splatsoil ")
+        message = " ".join(str(SplatsoilError(message)).split())  # words as they were given may act on a terminal
         print(f"splatsoil: {command}: {message}; {self.prog} --help lists its options", file=sys.stderr)
         raise SystemExit(2)
 

@@ -26,6 +26,8 @@ PROGRAM = 1.0
 RATE = {"cpu": 1.2e8, "cuda": 2.7e9}
 #: Simulations of a comparison besides those of the search.
 COMPARISON = 20
+#: Seconds of a year: a run that takes longer is a mistake.
+YEAR = 365 * 86400
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,8 @@ class Needs:
         """The needs in one line, for an unknown amount of soil."""
         return (
             f"needs up to {self.memory:.2g} of {memory():.2g} GiB of memory and {duration(self.seconds)} a simulation "
-            f"({self.particles} particles, {device}), {self.simulations} simulations"
+            f"({self.particles} particles, {device}), {self.simulations} simulations, "
+            f"{duration(self.seconds * self.simulations)} in all"
         )
 
 
@@ -82,6 +85,20 @@ def needs(measurement: Measurement, preset: str, device: str, simulations: int, 
         seconds=count * substeps * max(measurement.frames, default=0) / RATE[device.split(":")[0]],
         simulations=simulations,
     )
+
+
+def check_time(need: Needs, device: str, measurement: Measurement) -> None:
+    """Check that the run ends within a year.
+
+    Raises:
+        ParameterError: it does not.
+    """
+    if need.seconds * need.simulations > YEAR:
+        raise ParameterError(
+            f"{measurement.folder}: {need.simulations} simulations to frame {max(measurement.frames)} take"
+            f" {duration(need.seconds)} each on {device} ({need.particles} particles); leave out late frames of the"
+            " video, or choose a coarser --preset"
+        )
 
 
 def check_memory(need: Needs, device: str, file: Path) -> None:

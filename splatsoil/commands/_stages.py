@@ -17,7 +17,7 @@ from splatsoil.commands import _model, _workers
 from splatsoil.commands._model import ModelSpec, experiment_of, reconstruction_digest
 from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations, check_seed
 from splatsoil.commands._output import Report, Stage, by_frame, print_remarks
-from splatsoil.commands._resources import COMPARISON, check_memory, needs
+from splatsoil.commands._resources import COMPARISON, check_memory, check_time, needs
 from splatsoil.envs.devices import resolve_device
 from splatsoil.errors import MeasurementError, ParameterError, RunError
 from splatsoil.files import CRITICISM, code_digest, code_of, plain, write_bytes, write_json
@@ -67,7 +67,9 @@ def prepare(options: FitOptions) -> tuple[Measurement, RunFolder]:
     simulations = (options.budget or EVALUATIONS * max(1, len(options.parameters))) + COMPARISON
     pictures = needs(measurement, options.preset, device, simulations, particles=1)
     check_memory(pictures, device, options.set)  # the amount of soil is not known yet
-    print(needs(measurement, options.preset, device, simulations).sentence(device), file=sys.stderr)
+    whole = needs(measurement, options.preset, device, simulations)
+    check_time(whole, device, measurement)
+    print(whole.sentence(device), file=sys.stderr)
     run = RunFolder.prepare(
         options.folder(measurement.name),
         measurement={"name": measurement.name, "folder": str(measurement.folder.resolve()), "hash": measurement.hash},

@@ -227,7 +227,7 @@ def _footage(video: Video, camera: Camera) -> Footage:
     while factor * camera.width > WIDTH:
         factor *= 0.5
     small = camera.scaled(factor)
-    numbers = set(np.unique(np.linspace(0, video.count - 1, LOOKED_AT).astype(int)).tolist())
+    numbers = {video.numbers[k] for k in np.linspace(0, len(video.numbers) - 1, LOOKED_AT).astype(int)}
     times, pictures = [], []
     for number, picture in video.pictures(numbers):
         image = np.asarray(Image.fromarray(picture).resize((small.width, small.height), Image.Resampling.BOX))
@@ -240,8 +240,8 @@ def _footage(video: Video, camera: Camera) -> Footage:
 
 def _wanted(video: Video, zero: int, last: int | None, every: int) -> set[int]:
     """Frames of a video: every so many from ``zero`` on until the tool rests, and those just before."""
-    end = video.count if last is None else min(video.count, zero + last + 1)
-    wanted = {*range(max(zero, zero % every), end, every), *range(max(zero - PRE_ROLL, 0), min(zero, video.count))}
+    end = video.numbers[-1] + 1 if last is None else zero + last + 1
+    wanted = {*range(max(zero, zero % every), end, every), *range(zero - PRE_ROLL, zero)} & {*video.numbers}
     if not wanted:
         raise MeasurementError("the video ends before the tool moves, or begins after; is the clock's offset right?")
     return wanted

@@ -146,7 +146,7 @@ def tag_motion(videos: Mapping[str, tuple[Video, Camera]], tags: Mapping[int, Fl
     detector = _detector("--motion-tags")
     seen: dict[int, list[_Seen]] = {}
     for video, camera in videos.values():
-        for number, picture in video.pictures(set(range(video.count))):
+        for number, picture in video.pictures(set(video.numbers)):
             found = _seen(detector, np.rint(picture.mean(axis=2)).astype(np.uint8), camera, tags)
             if found:
                 seen.setdefault(number, []).extend(found)

@@ -17,7 +17,6 @@ from splatsoil.measurement.images import read_numbers
 
 FIELDS = ("corner", "cell", "noise", "frames")
 FRAME_FIELDS = ("file_path", "frame")
-_HIGHEST_TOOL = 50.0  # m over the bed
 _NO_DATA = 42113
 """TIFF tag in which GDAL keeps the number that stands for an unknown height."""
 
@@ -79,8 +78,8 @@ class HeightMaps:
     def check(self, lower: FloatArray, upper: FloatArray, slack: float) -> None:
         """Raise MeasurementError unless each grid shows the box from ``lower`` to ``upper`` (3,), in its unit.
 
-        Half of the heights lie in the box, which may be off by ``slack``, a share of it; none, the tool's included, is
-        far from it.
+        Half of the heights lie in the box, which may be off by ``slack``, a share of it; none is far below. What is
+        higher than the box is the tool, or what carries it.
         """
         depth = float(upper[2] - lower[2])
         if self.noise is not None and self.noise > depth:
@@ -98,7 +97,7 @@ class HeightMaps:
                     file=path,
                 )
             z, reaches = points[:, 2], f"the bed reaches from {lower[2]:g} to {upper[2]:g} m"
-            off = (z < lower[2] - depth) | (z > upper[2] + _HIGHEST_TOOL)
+            off = z < lower[2] - depth
             if 0 < off.sum() < len(z):
                 raise MeasurementError(
                     f"{off.sum()} heights are as {z[off][0]:g} m, where {reaches}; an unknown height is NaN", file=path

@@ -40,7 +40,6 @@ _DEPTHS = 10_000  # pixels of a depth map that are asked whether they show the b
 _AROUND = 0.2  # of the bed's narrower side: how much beyond it is simulated where nothing stands at its sides
 _SLACK = 0.1  # of the bed: what its floor and walls, which the tool can't pass, may be off by
 _SMALL_TOOL = 1e5  # cubes of the tool's width in the bed; cells are a fraction of it, and no memory holds as many
-_LONG_REST = 10  # durations of the motion, after it: what rests need not be simulated for longer
 _FASTEST_TOOL = 100.0  # m/s, the speed of sound in loose soil: nothing is pushed through it faster
 
 
@@ -335,11 +334,6 @@ def _check_clocks(measurement: Measurement) -> None:
         # What both contradict is itself at fault.
         file, field = off[0][:2] if len(off) == 1 else (experiment, "frame_rate")
         raise MeasurementError(f"{off[0][2]}; times are in seconds, 0 at frame 0", file=file, field=field)
-    first, last = (int(motion.frames[k]) for k in (0, -1))
-    for i, frame in enumerate(measurement.video):
-        if (frame.frame or 0) > last + _LONG_REST * (last - first):
-            fault = f"frame {frame.frame} is long after the tool's motion, which ends at frame {last}; leave it out"
-            raise MeasurementError(fault, file=video, field=f"frames[{i}].frame")
 
 
 def _check_tool(measurement: Measurement) -> None:

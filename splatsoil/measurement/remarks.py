@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain, islice
 
 import numpy as np
 
 from splatsoil.measurement.images import turned
 from splatsoil.measurement.measurement import Measurement, sees
 
+_NAMED = 4  # frames or images that a remark lists
 _FEW_VIEWS = 12
 _EARTH = (9.76, 9.84)  # m/s², from the equator's mountains to the poles
 _OFF_MIDDLE = 0.25  # of the image: further off its middle a principal point is that of a crop, or in another unit
@@ -94,7 +96,8 @@ def _on_video(measurement: Measurement) -> Iterator[str]:
     if beside := [n for n in measurement.height_frames if n >= 0 and n not in frames]:
         yield f"The video lacks {len(beside)} frames that have heights, which are not used: {_some(beside)}."
     if lost := _lost(frames):
-        yield f"The video lacks {len(lost)} frames in an otherwise even row: {_some(lost)}."
+        first = list(islice(chain.from_iterable(lost), _NAMED + 1))
+        yield f"The video lacks {sum(map(len, lost))} frames in an otherwise even row: {_some(first)}."
     if late := [n for n in frames if not motion.frames[0] <= n <= motion.frames[-1]]:
         yield f"The tool's motion does not cover {len(late)} video frames, where it is taken to rest: {_some(late)}."
     drift = [f for f in measurement.video if abs((f.time or 0.0) - (f.frame or 0) / rate) > 0.5 / rate]
@@ -163,15 +166,16 @@ def _on_force(measurement: Measurement) -> Iterator[str]:
         )
 
 
-def _lost(frames: tuple[int, ...]) -> list[int]:
+def _lost(frames: tuple[int, ...]) -> list[range]:
     """Numbers that would fill the gaps which are whole multiples of the usual step between frames."""
     steps = np.diff(frames)
     if len(steps) < 3:
         return []
-    usual = int(np.bincount(steps).argmax())
+    values, times = np.unique(steps, return_counts=True)
+    usual = int(values[times.argmax()])
     gaps = [(n, int(step)) for n, step in zip(frames, steps, strict=False) if step > usual and step % usual == 0]
-    return [n + k for n, step in gaps for k in range(usual, step, usual)]
+    return [range(n + usual, n + step, usual) for n, step in gaps]
 
 
-def _some(names: Sequence[object], most: int = 4) -> str:
-    return ", ".join(str(name) for name in names[:most]) + (" …" if len(names) > most else "")
+def _some(names: Sequence[object]) -> str:
+    return ", ".join(str(name) for name in names[:_NAMED]) + (" …" if len(names) > _NAMED else "")

@@ -41,9 +41,9 @@ class Cells:
 
 def seen_heights(measurement: Measurement, frame: int, cells: Cells) -> FloatArray:
     """(cells, 3) mean of the points that were measured in each cell at a frame, m; NaN where there are none, or where
-    the tool stands."""
+    the tool stands. No soil is higher than the bed's box."""
     points = measurement.surface_points(frame)
-    index = cells.index(points)
+    index = np.where(points[:, 2] <= measurement.bed.upper[2], cells.index(points), -1)
     points, index = points[index >= 0], index[index >= 0]
     count = np.bincount(index, minlength=cells.shape[0] * cells.shape[1]).astype(np.float64)
     count[_under_tool(measurement, frame, cells)] = 0.0

@@ -1,4 +1,4 @@
-"""Photometric check of the fixed cameras' poses, lenses and scale, against the scene reconstructed from the views."""
+"""Photometric checks of the fixed cameras' poses, lenses and scale, against the scene reconstructed from the views."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from splatsoil.arrays import BoolArray, FloatArray
 from splatsoil.measurement import Bed
@@ -27,12 +28,6 @@ class Likeness:
 
     correlation: FloatArray
     control: FloatArray
-
-    def unlike(self, fixed: int) -> BoolArray:
-        """Which of the last ``fixed`` pictures are less like the scene than any other: a rank test, by which one of
-        v + 1 is said to differ that does not."""
-        others = self.correlation[:-fixed][np.isfinite(self.correlation[:-fixed])]
-        return self.correlation[-fixed:] < others.min() if len(others) else np.zeros(fixed, dtype=bool)
 
     def unrelated(self, fixed: int) -> BoolArray:
         """Which of the last ``fixed`` pictures are no more like the scene than any picture is upside down.
@@ -59,28 +54,88 @@ def likeness(
         background: sRGB colour behind all Gaussians.
     """
     out = []
-    for k, camera in enumerate(views.cameras):
-        columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        origin, ray = camera.rays(np.stack([columns, rows], axis=-1))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            away = (level - origin[:, 2]) / ray[:, 2]
-            place = (origin + away[:, None] * ray)[:, :2]
-            soil = (away > 0.0) & (bed.beyond(place) < 0.0)
-        seen = soil.reshape(camera.height, camera.width)
-        seen = seen & (usable[k, : camera.height, : camera.width] > 0.0).cpu().numpy()
-        if not seen.any():
-            out.append((np.nan, np.nan))
-            continue
-        with torch.no_grad():
-            drawn = rasterise(gaussians, camera, background=background, antialias=True).colour
-        box = tuple(slice(where.min(), where.max() + 1) for where in np.nonzero(seen))
-        ours, theirs = (p.mean(dim=2).cpu().numpy()[box] for p in (drawn, views.photograph(k)))
-        seen = seen[box]
+    for k in range(len(views.cameras)):
+        ours, theirs, seen = _pictures(gaussians, views, usable, bed, level, background, k)
         out.append((_correlation(ours, theirs, seen), _correlation(ours[::-1, ::-1], theirs, seen & seen[::-1, ::-1])))
     return Likeness(*np.array(out).reshape(-1, 2).T)
 
 
-def _correlation(one: NDArray[np.float32], other: NDArray[np.float32], where: BoolArray) -> float:
+def displacements(
+    gaussians: Gaussians,
+    views: Views,
+    usable: torch.Tensor,
+    bed: Bed,
+    level: float,
+    background: tuple[float, ...],
+    fixed: int,
+) -> FloatArray:
+    """Displacement (fixed,) of the soil in the last pictures from where the scene is drawn: root mean square over its
+    pixels, px; NaN where there is no soil. The other arguments are those of `likeness`."""
+    last = range(len(views.cameras) - fixed, len(views.cameras))
+    return np.array([_displacement(*_pictures(gaussians, views, usable, bed, level, background, k)) for k in last])
+
+
+def _pictures(
+    gaussians: Gaussians,
+    views: Views,
+    usable: torch.Tensor,
+    bed: Bed,
+    level: float,
+    background: tuple[float, ...],
+    k: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], BoolArray]:
+    """Of a picture the box (h, w) around its soil: grey levels as drawn, as observed, and which pixels show soil."""
+    camera = views.cameras[k]
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    origin, ray = camera.rays(np.stack([columns, rows], axis=-1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away = (level - origin[:, 2]) / ray[:, 2]
+        place = (origin + away[:, None] * ray)[:, :2]
+        soil = (away > 0.0) & (bed.beyond(place) < 0.0)
+    seen = soil.reshape(camera.height, camera.width)
+    seen = seen & (usable[k, : camera.height, : camera.width] > 0.0).cpu().numpy()
+    if not seen.any():
+        none = np.zeros((0, 0))
+        return none, none, none.astype(bool)
+    with torch.no_grad():
+        drawn = rasterise(gaussians, camera, background=background, antialias=True).colour
+    box = tuple(slice(where.min(), where.max() + 1) for where in np.nonzero(seen))
+    ours, theirs = (p.mean(dim=2).cpu().numpy()[box].astype(np.float64) for p in (drawn, views.photograph(k)))
+    return ours, theirs, seen[box]
+
+
+def _displacement(drawn: NDArray[np.float64], photograph: NDArray[np.float64], seen: BoolArray) -> float:
+    """Root mean square, px, of the affine map of one picture onto the other.
+
+    The map, a gain and an offset minimise Geman and McClure's function of the differences, by Gauss-Newton steps from
+    coarse to fine (Lucas & Kanade 1981; Baker & Matthews 2004, IJCV 56:221): a wall over less than half of the soil
+    does not count.
+    """
+    if np.count_nonzero(seen) < 9:  # as many as unknowns, and one more
+        return float("nan")
+    places = np.argwhere(seen).astype(np.float64)
+    away = places - places.mean(axis=0)
+    basis = np.column_stack([np.ones(len(away)), away / np.sqrt(np.mean(away**2))])
+    moved = np.zeros((3, 2))
+    for blur in (4.0, 2.0, 1.0):
+        weight = np.maximum(gaussian_filter(seen.astype(np.float64), blur), 1e-6)
+        ours, theirs = (gaussian_filter(np.where(seen, p, 0.0), blur) / weight for p in (drawn, photograph))
+        counts = np.ones(len(away))
+        for _ in range(20):
+            at = (places + basis @ moved).T
+            here, down, right = (map_coordinates(p, at, order=1, mode="nearest") for p in (ours, *np.gradient(ours)))
+            light = np.column_stack([here, np.ones(len(here))])
+            slopes = np.column_stack([down[:, None] * basis, right[:, None] * basis, light])
+            left = theirs[seen] - here
+            step = np.linalg.lstsq(slopes * counts[:, None], left * counts, rcond=None)[0]
+            left = left - slopes @ step
+            spread = 1.4826 * np.median(np.abs(left)) + 1e-9
+            counts = 1.0 / (1.0 + (left / (2.0 * spread)) ** 2)
+            moved += step[:6].reshape(2, 3).T / max(1.0 + step[6], 0.2)
+    return float(np.sqrt(np.mean(np.sum((basis @ moved) ** 2, axis=1))))
+
+
+def _correlation(one: NDArray[np.float64], other: NDArray[np.float64], where: BoolArray) -> float:
     """By the median absolute deviations of sum and difference (Gnanadesikan & Kettenring 1972, Biometrics 28:81), NaN
     where there is nothing to compare."""
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from splatsoil import __version__
@@ -20,7 +19,7 @@ from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.heights import first_surface
 from splatsoil.reconstruction.hidden import reaching_into_soil
 from splatsoil.reconstruction.initial import SIDE, TOOL, first_gaussians
-from splatsoil.reconstruction.likeness import Likeness, likeness
+from splatsoil.reconstruction.likeness import displacements, likeness
 from splatsoil.reconstruction.presets import preset_named
 from splatsoil.reconstruction.result import HeldOut, Reconstruction
 from splatsoil.reconstruction.sides import sides_seen
@@ -32,6 +31,8 @@ from splatsoil.threads import one_thread
 
 FEWEST_VIEWS = 3
 NO_BACKGROUND = (0.0, 0.0, 0.0)
+RESOLVED = 1.0
+"""Displacement in a fixed camera's picture, px, beyond which its pose is not that of the views' world."""
 
 
 @one_thread()
@@ -122,10 +123,13 @@ def reconstruct(
         # Before training, which bends the scene to what it is shown.
         level = float(np.median(geometry.surface.height))
         alike = likeness(first, views, geometry.usable, bed, level, NO_BACKGROUND)
-        for camera in unlike_cameras(alike, cameras, alike.unrelated(len(cameras))):
+        usual = np.nanmedian(alike.correlation[: -len(cameras)])
+        for k in np.flatnonzero(alike.unrelated(len(cameras))):
+            value = alike.correlation[k - len(cameras)]
             raise MeasurementError(
-                f"the bed that {camera} sees is not that in the views: their poses and lenses must be of one world and"
-                " scale, and the bed the same",
+                f"the bed that camera {cameras[k]!r} (its picture correlates with the reconstruction by {value:.2f},"
+                f" the views by {usual:.2f}) sees is not that in the views: their poses and lenses must be of one world"
+                " and scale, and the bed the same",
                 file=measurement.folder,
                 field="video",
             )
@@ -146,11 +150,12 @@ def reconstruct(
     if cameras:
         report("comparing with the video", 0.0)
         level = float(np.median(surface.height))
-        alike = likeness(scene, views, geometry.usable, bed, level, trained.background)
+        apart = displacements(scene, views, geometry.usable, bed, level, trained.background, len(cameras))
         remarks += [
-            f"video: The bed that {camera} sees differs from that in the views; are their poses and lenses of one world"
-            " and scale, and is the bed the same?"
-            for camera in unlike_cameras(alike, cameras, alike.unlike(len(cameras)))
+            f"video: The bed that camera {camera!r} sees is displaced by {value:.1f} px from that in the views; are"
+            " their poses and lenses of one world and scale, and is the bed the same?"
+            for camera, value in zip(cameras, apart, strict=True)
+            if value > RESOLVED
         ]
     held_out = judged(scene, every.subset(aside), trained.background)
     made = Reconstruction(
@@ -178,16 +183,6 @@ def reconstruct(
 def no_gaussians() -> Gaussians:
     """None at all."""
     return Gaussians(*(torch.zeros(0, *shape) for shape in ((3,), (3,), (4,), (), (3,))))
-
-
-def unlike_cameras(alike: Likeness, cameras: Sequence[str], which: NDArray[np.bool_]) -> list[str]:
-    """Fixed cameras, whose pictures come last, in words: ``which`` of them, and how like the scene theirs are."""
-    usual = np.nanmedian(alike.correlation[: -len(cameras)])
-    return [
-        f"camera {name!r} (its picture correlates with the reconstruction by {value:.2f}, the views by {usual:.2f})"
-        for name, value, said in zip(cameras, alike.correlation[-len(cameras) :], which, strict=True)
-        if said
-    ]
 
 
 def segments(

@@ -356,10 +356,12 @@ def model_name(name: str) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A time for readers: "48 s", "3 min 20 s", "2 h 5 min"."""
+    """A time for readers: "48 s", "3 min 20 s", "2 h 5 min", "40 d 2 h"."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"
     if whole < 3600:
         return f"{whole // 60} min {whole % 60} s"
-    return f"{whole // 3600} h {whole % 3600 // 60} min"
+    if whole < 86400:
+        return f"{whole // 3600} h {whole % 3600 // 60} min"
+    return f"{whole // 86400} d {whole % 86400 // 3600} h"

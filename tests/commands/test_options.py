@@ -1,18 +1,26 @@
-"""Options: what is parsed, what help says of it, and what Ctrl-C says can be pasted."""
+"""Options: what is parsed, what help says of it, what Ctrl-C says can be pasted, and what makes no sense."""
 
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import re
 import shlex
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
+from hypothesis import HealthCheck, given, note, settings
+from hypothesis import strategies as st
+from splatsoil.inverse.run_folder import RunFolder
 
 from splatsoil import cli
 from splatsoil.commands._options import FitOptions, parse, parser_of, same_again
+from splatsoil.errors import RunError
 from splatsoil.options import argument, option
 
 #: Options of each command, none of them as usual.
@@ -137,3 +145,106 @@ def test_the_commands_of_the_documents_parse(repository: Path, document: str) ->
             parse(name, commands[name].Config, words)
             parsed += 1
     assert parsed >= DOCUMENTS[document]
+
+
+#: Places in the lines of `GIVEN`, and what is put there: SET is a set, RUN a run.
+PLACES = {"my set": "SET", "a set": "SET", "nowhere": "SET", "a run": "RUN", "runs/a": "RUN", "a folder": "SET/views"}
+ODD = st.sampled_from(
+    ["", " ", "-", "--", "-1", "0", "1", "2", "nan", "inf", "-inf", "1e400", "1e-400", "9" * 30, "0x10", "1_0", "½",
+     "１", ".", "..", "/", "~", "*", "a=b", "=", "a=1=2", "--json", "--help", "-h", "--run", "--set", "--with",
+     "--device", "cpu", "cuda:0", "cuda:-1", "auto", "tiny", "cohesion", "cohesion=1e3", "tilt", "friction_angle",
+     "csv", "SET", "RUN", "SET/tool.stl", "RUN/fit.json", "full", "full/note.txt", "new", "a\nb", "a\0b", "\ud800",
+     "ü ö", "😀", "x" * 5000, "$(touch x)", "`touch x`", "<b>", "[red]", "%s", "{0}"]
+)  # fmt: skip
+
+
+@st.composite
+def lines(draw: st.DrawFn) -> list[str]:
+    """The words of a command with all of its options, of which some are left out, doubled, moved or replaced."""
+    name = draw(st.sampled_from(sorted(GIVEN)))
+    words = [PLACES.get(word, word) for word in shlex.split(GIVEN[name])]
+    for _ in range(draw(st.integers(1, 4))):
+        how = draw(st.sampled_from(["odd", "odd", "drop", "again", "put", "swap", "cut"]))
+        k = draw(st.integers(0, max(len(words) - 1, 0)))
+        if how == "put" or not words:
+            words.insert(k, draw(ODD))
+        elif how == "odd":
+            words[k] = draw(ODD)
+        elif how == "drop":
+            del words[k]
+        elif how == "again":
+            words.insert(k, words[k])
+        elif how == "swap":
+            words[k], words[-1] = words[-1], words[k]
+        else:
+            words = words[: k + 1]
+    return [name, *words]
+
+
+@pytest.fixture
+def idle(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where work would begin, it ends."""
+
+    def begun(*_: object, **__: object) -> Any:
+        raise RunError("work would begin here")
+
+    for name in (
+        "splatsoil.reconstruction.reconstruct",
+        "splatsoil.commands._model.reconstructed",
+        "splatsoil.commands._model.model_of",
+        "splatsoil.commands._model.model_on",
+        "splatsoil.synthetic.make_set",
+        "splatsoil.soil.element.drive",
+        "splatsoil.importing.build.import_set",
+        "splatsoil.inverse.posterior.run_posterior",
+    ):
+        monkeypatch.setattr(name, begun)
+    there = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *_: None if name == "viser" else there(name))
+
+
+def files(place: Path) -> dict[Path, bytes | None]:
+    found = (p for p in place.rglob("*") if not p.name.startswith("writer.lock"))
+    return {p: p.read_bytes() if p.is_file() else None for p in found}
+
+
+@settings(
+    max_examples=1000,
+    derandomize=True,
+    database=None,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+@given(words=lines())
+def check_lines(run: RunFolder, small_set: Path, place: Path, words: list[str]) -> None:
+    words = [word.replace("SET", str(small_set)).replace("RUN", str(run.path)) for word in words]
+    note(shlex.join(words))
+    before, out, err = files(place), StringIO(), StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        try:
+            code = cli.main(words)
+        except SystemExit as left:
+            code = left.code
+    assert code in (0, 2, 3)
+    if code == 2 and "work would begin here" not in err.getvalue():
+        note(err.getvalue()[:2000])
+        *stages, said = err.getvalue().splitlines()
+        assert said.startswith("splatsoil: ") and not [line for line in stages if line.startswith("splatsoil: ")]
+        assert files(place) == before
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("idle")
+def test_command_lines_begin_end_or_are_refused_in_a_sentence(
+    run: RunFolder,
+    fit_of: Callable[..., dict[str, Any]],
+    small_set: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run.write_fit("base", fit_of())
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "note.txt").write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path.parent / "state"))
+    check_lines(run=run, small_set=small_set, place=tmp_path)

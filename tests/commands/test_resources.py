@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -10,6 +12,7 @@ from typing import Any, cast
 import pytest
 from splatsoil.inverse.run_folder import RunFolder
 
+from splatsoil import cli
 from splatsoil.commands import _resources, _stages
 from splatsoil.commands._options import FitOptions
 from splatsoil.errors import ParameterError
@@ -56,7 +59,35 @@ def test_what_a_fit_needs_is_said_and_refused_where_no_memory_holds_it(
     monkeypatch.undo()
     _stages.prepare(options)
     said = capsys.readouterr().err.splitlines()[-1]
-    assert said.startswith("needs up to ") and "(13500 particles, cpu), 30 simulations" in said
+    assert said.startswith("needs up to ") and "(13500 particles, cpu), 30 simulations, " in said
+
+
+def test_a_frame_far_after_the_others_is_remarked_on_and_its_time_said_or_refused(
+    small_set: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], refused: Callable[..., str]
+) -> None:
+    """A number with a digit too many, and one that is a time in Unix's nanoseconds."""
+    file = small_set / "video" / "transforms.json"
+    video = json.loads(file.read_text())
+    rate = json.loads((small_set / "experiment.json").read_text())["frame_rate"]
+    for frame in video["frames"][-2:]:
+        frame |= {"frame": 1000, "time": 1000 / rate}
+    file.write_text(json.dumps(video))
+    assert cli.main(["check", str(small_set)]) == 0
+    assert "does not cover" in capsys.readouterr().out
+    late = Measurement.load(small_set)
+    need = _resources.needs(late, "tiny", "cpu", 10)
+    assert need.seconds == pytest.approx(100 * _resources.needs(_until(late, 10), "tiny", "cpu", 10).seconds)
+    for frame in video["frames"][-2:]:
+        frame |= {"frame": 10**9, "time": 10**9 / rate}
+    file.write_text(json.dumps(video))
+    assert cli.main(["check", str(small_set)]) == 0
+    said = refused("fit", small_set, "--preset", "tiny", "--device", "cpu", "--run", tmp_path / "run")
+    assert "30 simulations to frame 1000000000 take" in said and not (tmp_path / "run").exists()
+
+
+def _until(measurement: Measurement, last: int) -> Measurement:
+    """The set without later frames, which are numbered anew."""
+    return replace(measurement, video=tuple(replace(f, frame=min(f.frame or 0, last)) for f in measurement.video))
 
 
 def test_soil_that_no_memory_holds_is_refused_before_it_is_simulated(

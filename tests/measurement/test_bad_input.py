@@ -325,8 +325,6 @@ CASES: dict[str, tuple[Spoil, str, str | None, str]] = {
     "fisheye-cropped": (both(edit(VIEWS, "camera_model", to="OPENCV_FISHEYE"), edit(VIEWS, "fisheye_crop_radius",
         to=100)), VIEWS, "fisheye_crop_radius", "has no"),
     # video
-    "video-frame-long-after-the-motion": (both(shot(3, "frame", 10**8), shot(3, "time", 2e6)), VIDEO, "frames[3].frame",
-        "long after the tool's motion"),
     "video-frame-twice": (in_json(VIDEO, duplicated), VIDEO, "frames[2].frame", "given twice"),
     "video-time-backwards": (shot(6, "time", -5.0), VIDEO, "frames[6].time", "runs backwards"),
     "video-without-camera": (drop(VIDEO, "frames", 0, "camera"), VIDEO, "frames[0].camera", "missing"),

@@ -15,6 +15,7 @@ import tifffile
 from splatsoil.cli import main
 from splatsoil.measurement import Camera, Contents, Frame, HeightMaps, Measurement, Picture, remarks, write_measurement
 from splatsoil.measurement.heights import depth_points, read_heights
+from splatsoil.reconstruction.heights import Cells, seen_heights
 
 RAMP = np.linspace(0.1, 0.14, 16 * 10).reshape(10, 16).astype(np.float32)
 """Heights of a grid of 5 cm over a bed of 0.8 x 0.5 m, the first row at the lowest y."""
@@ -142,6 +143,21 @@ def test_bad_heights_are_refused_by_one_sentence(
     assert main(["check", str(small_set)]) == 2
     told = capsys.readouterr()
     assert said in told.err and "heights" in told.err and len(told.err.splitlines()) == 1 and not told.out
+
+
+def test_what_is_higher_than_the_bed_is_no_soil(small_set: Path) -> None:
+    """A gantry, or 9999 for unknown: cells with nothing else are unknown, others are as without it."""
+    plain = Measurement.load(with_heights(small_set, {0: RAMP})).bed
+    cells = Cells(plain.lower[:2], np.array([0.1, 0.1]), (5, 8))
+    alone = seen_heights(Measurement.load(small_set), 0, cells)
+    high = RAMP.copy()
+    high[0, 0], high[8:10, 12:14] = 9999.0, plain.upper[2] + 2.0
+    np.save(small_set / "heights" / "0.npy", high)
+    found = seen_heights(Measurement.load(small_set), 0, cells)
+    kept = np.isfinite(found)
+    assert np.isfinite(alone).sum() > kept.sum() > 0
+    np.testing.assert_allclose(found[kept], alone[kept], atol=0.05)
+    assert np.nanmax(found[:, 2]) <= plain.upper[2]
 
 
 def test_without_a_video_there_must_be_heights_and_without_views_no_video(
