@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -525,6 +527,17 @@ def test_faulty_tags_of_the_tool(
     assert "needs --video" in importing(plow, *words)["error"]
     said = importing(plow, *words, "--video", *(f"{name}.mp4={name}.jpg" for name in plow.true.cameras))
     assert said["code"] == 2 and error in said["error"]
+
+
+def test_detectors_end_without_reading_freed_memory() -> None:
+    """Which glibc overwrites here."""
+    pytest.importorskip("pupil_apriltags")
+    code = (
+        "import numpy as np\nfrom splatsoil.importing.tags import _detector\n"
+        "for _ in range(20):\n    _detector('--tags').detect(np.zeros((48, 64), np.uint8))\n"
+    )
+    words, perturbed = [sys.executable, "-c", code], {**os.environ, "MALLOC_PERTURB_": "165"}
+    assert subprocess.run(words, env=perturbed, timeout=120, check=False).returncode == 0
 
 
 def test_photographs_without_tags(plow: Recorded, importing: Callable[..., dict[str, Any]]) -> None:

@@ -34,9 +34,7 @@ class ImportOptions:
     motion: tuple[Path, str] | None = option(
         None, "Flange in the robot's frame: time,x,y,z,qw,qx,qy,qz.", metavar="CSV UNIT"
     )
-    motion_tags: Path | None = option(
-        None, "AprilTags on the tool: tag,corner,x,y,z (m).", metavar="CSV", expert=True
-    )
+    motion_tags: Path | None = option(None, "AprilTags on the tool: tag,corner,x,y,z (m).", metavar="CSV", expert=True)
     force: Path | None = option(None, "On the tool, robot's axes: time,fx,fy,fz (N).", metavar="CSV")
     robot_to_world: Path | None = option(None, "4 x 4 (m), from hand-eye calibration.", metavar="FILE", expert=True)
     mesh_to_flange: Path | None = option(None, "4 x 4 (m), how the mesh is mounted.", metavar="FILE", expert=True)

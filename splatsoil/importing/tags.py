@@ -41,7 +41,10 @@ def _detector(option: str) -> Any:
         from pupil_apriltags import Detector
     except ImportError as error:
         raise ParameterError(f"{option}: needs pupil-apriltags; pip install 'splatsoil[tags]'") from error
-    return Detector(families=FAMILY)
+    detector = Detector(families=FAMILY)
+    # It frees the families before the detector, which reads them then (pupil-labs/apriltags, pull request 65): keep them.
+    detector.tag_families = {}
+    return detector
 
 
 def _grey(frame: Frame) -> npt.NDArray[np.uint8]:
