@@ -42,7 +42,7 @@ def _detector(option: str) -> Any:
     except ImportError as error:
         raise ParameterError(f"{option}: needs pupil-apriltags; pip install 'splatsoil[tags]'") from error
     detector = Detector(families=FAMILY)
-    # It frees the families before the detector, which reads them then (pupil-labs/apriltags, pull request 65): keep them.
+    # It would free the families before the detector, which reads them then (pupil-labs/apriltags, pull request 65).
     detector.tag_families = {}
     return detector
 
