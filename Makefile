@@ -1,7 +1,7 @@
 # Each target does its own set-up on a machine that has python3 (>= 3.11) and make; the second time it is quick.
 #
 #   make demo     the whole path on examples/plow-dry, ending in runs/demo/report.html
-#   make test     the tests
+#   make test     the tests; sets up with every extra, 0.4 GB besides PyTorch
 #   make test-slow  the tests that take minutes: whole reconstructions and simulations of the example sets
 #   make mutants  small faults in the source, one at a time, and which of them no test sees; an hour
 #   make lint     formatting, lint, unused code and types

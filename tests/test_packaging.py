@@ -37,6 +37,13 @@ def project(repository: Path) -> dict[str, Any]:
     return tomllib.loads((repository / "pyproject.toml").read_text())
 
 
+def test_the_developers_environment_leaves_no_test_out(project: dict[str, Any]) -> None:
+    """Tests skip what is not installed, so `make test` installs every extra."""
+    extras = project["project"]["optional-dependencies"]
+    (with_all,) = (word for word in extras.pop("dev") if word.startswith("splatsoil["))
+    assert set(with_all.removeprefix("splatsoil[").rstrip("]").split(",")) == extras.keys()
+
+
 @pytest.fixture(scope="module")
 def wheel(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel, built from a copy of the sources, so that no old build folder can slip into it."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from splatsoil.commands import _laboratory
 from splatsoil.commands._options import SET
 from splatsoil.commands._output import print_result, print_table, print_text
+from splatsoil.errors import ParameterError
 from splatsoil.files import plain
 from splatsoil.options import JSON, argument, option
 
@@ -22,9 +23,12 @@ INTERRUPTED = "nothing was written; start again with"
 
 @dataclass(frozen=True)
 class Config:
-    """List the contents of a measurement set, and its errors. Writes nothing."""
+    """List the contents of a measurement set, and its errors. Writes nothing but --pictures."""
 
     set: Path = argument(SET)
+    pictures: Path | None = option(
+        None, "New folder of the photographs with bed, tool and motion drawn over them.", metavar="FOLDER"
+    )
     json: bool = option(False, JSON)
 
 
@@ -36,6 +40,8 @@ def run(config: Config) -> int:
         return _laboratory.check(config)
     measurement = Measurement.load(config.set)
     found = remarks(measurement)
+    if config.pictures is not None:
+        _draw(measurement, config.pictures)
 
     def show() -> None:
         print_table(f"{measurement.name} ({measurement.folder})", (), _rows(measurement))
@@ -44,6 +50,18 @@ def run(config: Config) -> int:
     data = {**_as_json(measurement), "remarks": [asdict(remark) for remark in found]}
     last = "The set can be used as it is." if found else "The set is complete and consistent."
     return print_result(config, data, show, last=last)
+
+
+def _draw(measurement: Measurement, folder: Path) -> None:
+    """Write the photographs with the set's geometry drawn over them."""
+    from splatsoil.measurement.writer import whole_folder
+    from splatsoil.report.overlay import overlays
+
+    if not measurement.views and not measurement.video:
+        raise ParameterError(f"--pictures: {measurement.name} has no photographs")
+    with whole_folder(folder) as root:
+        for name, picture in overlays(measurement):
+            picture.save(root / f"{name}.jpg", quality=90)
 
 
 def _as_json(measurement: Measurement) -> dict[str, Any]:

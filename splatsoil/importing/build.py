@@ -24,7 +24,7 @@ from splatsoil.importing.similarity import (
     read_points,
 )
 from splatsoil.importing.source import Source, find_image, read_source
-from splatsoil.importing.tags import TagMotion, read_tool_tags, tag_motion, tag_scale
+from splatsoil.importing.tags import TagMotion, ToolTags, find_tool_tags, read_tool_tags, tag_scale
 from splatsoil.importing.video import Video
 from splatsoil.measurement.camera import Camera
 from splatsoil.measurement.fields import Fields
@@ -95,26 +95,31 @@ def import_set(options: ImportOptions, report: Report) -> Imported:
 def _filled(root: Path, options: ImportOptions, report: Report) -> Imported:
     report("posing the photographs" if options.sfm else "reading the views", 0.0)
     found = read_source(options.source, options.images, sfm=options.sfm)
-    similarity, marks, left = _similarity(found, options)
     stills = {name: find_image(found.frames, image) for name, (_, image) in options.cameras.items()}
     aside = {still.path for still in stills.values()}
-    views = [moved(frame, similarity) for frame in found.frames if frame.path not in aside]
-    if not views:
+    photographs = [frame for frame in found.frames if frame.path not in aside]
+    if not photographs:
         raise MeasurementError(
             "no view is left: all photographs give the video's cameras their poses", file=options.source
         )
+    _scale_option(options)  # before videos are read
+    videos = {name: _opened(path, image, stills[name].camera) for name, (path, image) in options.cameras.items()}
+    tool_tags = None
+    if options.motion_tags is not None:
+        if options.motion is not None or not videos:
+            raise MeasurementError(f"--motion-tags: {'leave --motion out' if videos else 'needs --video'}")
+        report("finding the tool's tags", 0.05)
+        posed = {name: (video, stills[name].camera) for name, video in videos.items()}
+        tool_tags = find_tool_tags(photographs, posed, read_tool_tags(options.motion_tags))
+    similarity, marks, left = _similarity(found, options, tool_tags)
+    views = [moved(frame, similarity) for frame in photographs]
     cameras = {name: moved(still, similarity).camera for name, still in stills.items()}
-    videos = {name: _opened(path, image, cameras[name]) for name, (path, image) in options.cameras.items()}
     mesh = None if options.tool is None else _mesh(*options.tool)
     to_world, to_flange = read_rigid(options.robot_to_world), read_rigid(options.mesh_to_flange)
     motion = None if options.motion is None else read_motion(*options.motion, to_world, to_flange)
     tags = None
-    if options.motion_tags is not None:
-        if motion is not None or not videos:
-            raise MeasurementError(f"--motion-tags: {'leave --motion out' if videos else 'needs --video'}")
-        report("finding the tool's tags", 0.1)
-        corners = read_tool_tags(options.motion_tags)
-        tags = tag_motion({name: (video, cameras[name]) for name, video in videos.items()}, corners)
+    if tool_tags is not None:
+        tags = tool_tags.motion(similarity)
         # What follows is on the clock of the force, as a robot's motion is.
         motion = replace(tags.motion, times=tags.motion.times + (options.clock_offset or 0.0))
     experiment = Fields({}, options.out) if options.experiment is None else Fields.read(options.experiment)
@@ -160,15 +165,25 @@ def _filled(root: Path, options: ImportOptions, report: Report) -> Imported:
     return Imported(found.kind, len(views), similarity, marks, left, frames, clock, tags, missing)
 
 
-def _similarity(source: Source, options: ImportOptions) -> tuple[FloatArray, float, float | None]:
-    """From the source's world to the set's; errors of marks in px, of known points in m."""
-    ways = {f"--{name}": getattr(options, name) for name in ("scale", "distance", "tags", "known")}
-    given = [name for name, value in ways.items() if value is not None]
+def _scale_option(options: ImportOptions) -> str:
+    """The option that determines the scale: --motion-tags if there is no other."""
+    names = ("scale", "distance", "tags", "known")
+    given = [f"--{name}" for name in names if getattr(options, name) is not None]
+    if not given and options.motion_tags is not None:
+        given = ["--motion-tags"]
     if len(given) != 1:
         what = f"{' and '.join(given)} contradict each other" if given else "no scale is given"
-        raise MeasurementError(f"{what}; give one of --scale, --distance, --tags and --known")
-    if given[0] in ("--distance", "--known") and options.points is None:
-        raise MeasurementError(f"{given[0]}: needs --points, the places of these points in the source")
+        raise MeasurementError(f"{what}; give one of --scale, --distance, --tags, --known and --motion-tags")
+    return given[0]
+
+
+def _similarity(
+    source: Source, options: ImportOptions, tool_tags: ToolTags | None
+) -> tuple[FloatArray, float, float | None]:
+    """From the source's world to the set's; errors of marks in px, of known points in m."""
+    way = _scale_option(options)
+    if way in ("--distance", "--known") and options.points is None:
+        raise MeasurementError(f"{way}: needs --points, the places of these points in the source")
     marked = None if options.points is None else read_marked(options.points, source.frames)
     if options.known is not None:
         if options.up is not None:
@@ -178,15 +193,18 @@ def _similarity(source: Source, options: ImportOptions) -> tuple[FloatArray, flo
         return similarity, marked.error, left
     if options.up is None and not source.has_up:
         raise MeasurementError(f"{source.kind} does not define which way is up; give --up or --known")
+    error = 0.0 if marked is None else marked.error
     if options.tags is not None:
-        scale, marked = tag_scale(source.frames, options.tags)
+        scale, error = tag_scale(source.frames, options.tags)
     elif options.distance is not None:
         assert marked is not None
         scale = distance_scale(marked.places, *options.distance)
-    else:
-        assert options.scale is not None
+    elif options.scale is not None:
         scale = options.scale
-    return by_scale(scale, options.up or (0.0, 0.0, 1.0)), 0.0 if marked is None else marked.error, None
+    else:
+        assert tool_tags is not None
+        scale, error = tool_tags.scale()
+    return by_scale(scale, options.up or (0.0, 0.0, 1.0)), error, None
 
 
 def _mesh(file: Path, unit: str) -> Any:

@@ -12,7 +12,7 @@ from splatsoil.options import argument, option
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What is imported; one of `scale`, `distance`, `tags` and `known` determines the scale."""
+    """What is imported; one of `scale`, `distance`, `tags` and `known` determines the scale, else `motion_tags`."""
 
     source: Path = argument("transforms.json, or the folder of it or of a COLMAP model; of photographs, with --sfm.")
     out: Path = argument("Folder of the new set, or of parts of one; new or empty.")
@@ -34,9 +34,7 @@ class ImportOptions:
     motion: tuple[Path, str] | None = option(
         None, "Flange in the robot's frame: time,x,y,z,qw,qx,qy,qz.", metavar="CSV UNIT"
     )
-    motion_tags: Path | None = option(
-        None, "AprilTags on the tool instead: tag,corner,x,y,z (m).", metavar="CSV", expert=True
-    )
+    motion_tags: Path | None = option(None, "AprilTags on the tool: tag,corner,x,y,z (m).", metavar="CSV", expert=True)
     force: Path | None = option(None, "On the tool, robot's axes: time,fx,fy,fz (N).", metavar="CSV")
     robot_to_world: Path | None = option(None, "4 x 4 (m), from hand-eye calibration.", metavar="FILE", expert=True)
     mesh_to_flange: Path | None = option(None, "4 x 4 (m), how the mesh is mounted.", metavar="FILE", expert=True)

@@ -23,6 +23,7 @@ from splatsoil.measurement.tool import DEFAULT_FRICTION, Tool, read_force, read_
 
 FORMAT = "splatsoil-measurement/1"
 EXPERIMENT = "experiment.json"
+MAKING = "; splatsoil import makes one of photographs and videos"
 FIELDS = ("format", "name", "up", "gravity", "frame_rate", "bed", "tool", "views", "video", "heights")
 BED_FIELDS = ("lower", "upper", "density", "container", "wall_friction", "floor_friction")
 BIN, TRANSPARENT, OPEN, HEAP = "bin", "transparent", "open", "heap"
@@ -139,9 +140,9 @@ class Measurement:
         check_paths([root])
         if not root.is_dir():
             fault = "not a folder" if root.exists() else "no such folder"
-            raise MeasurementError(f"{fault}; give the folder of a measurement set", file=root)
+            raise MeasurementError(f"{fault}; give the folder of a measurement set{MAKING}", file=root)
         if not file.is_file():
-            raise MeasurementError(f"no {EXPERIMENT} in this folder; it is no measurement set", file=file)
+            raise MeasurementError(f"no {EXPERIMENT} in this folder; it is no measurement set{MAKING}", file=file)
         fields = Fields.read(inside(EXPERIMENT, root, root, file, ""))
         fields.check_names(FIELDS)
         tag = fields.text("format")

@@ -445,9 +445,11 @@ def test_good_set_passes(small_set: Path) -> None:
 def test_a_set_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(tmp_path / "nowhere")]) == 2
     assert "no such folder" in capsys.readouterr().err
-    (tmp_path / "file").write_text("")
-    assert main(["check", str(tmp_path / "file")]) == 2
-    assert "not a folder" in capsys.readouterr().err
+    (tmp_path / "video.MOV").write_text("")
+    for name, fault in (("video.MOV", "not a folder"), (".", "no experiment.json")):
+        assert main(["check", str(tmp_path / name)]) == 2
+        told = capsys.readouterr().err
+        assert fault in told and "splatsoil import makes one of photographs and videos" in told
 
 
 @pytest.mark.parametrize("name", ["a\0b", "a" * 5000])
