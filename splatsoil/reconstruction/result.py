@@ -105,9 +105,9 @@ class Reconstruction:
             return ""
         cell = 1e3 * float(self.metadata["simulation_cell"])
         return (
-            f"photographs set aside are predicted to {self.psnr:.1f} dB only, as if the soil lay more than a cell of the"
-            f" simulation ({cell:.3g} mm, {displaced:.1f} dB) from where it is; poses or lenses of the views are wrong,"
-            " or photographs are blurred or of different scenes"
+            f"photographs set aside are predicted to {self.psnr:.1f} dB only, as if the soil lay more than a cell of"
+            f" the simulation ({cell:.3g} mm, {displaced:.1f} dB) from where it is; poses or lenses of the views are"
+            " wrong, or photographs are blurred or of different scenes"
         )
 
     def say_remarks(self) -> None:
