@@ -5,6 +5,8 @@ compares what each effect changes with the noise in four representations: (a) tr
 (b) the comparison's features of particles that fill the true surface, drawn by us; (c) the same from the reconstructed
 surface; (d) those once the angle is refitted and all of the comparison's noise counts. Simulations are kept in the
 folder, and a second call continues from there.
+
+With ``--heights``, the set has heights, too, and the table is of (d) by instruments.
 """
 
 from __future__ import annotations
@@ -42,6 +44,7 @@ from splatsoil.inverse.criticism.simulations import Simulations
 
 from splatsoil.errors import SimulationError
 from splatsoil.experiment import Candidate, Layout, Run, Site
+from splatsoil.experiment.heights import CHANNEL
 from splatsoil.experiment.plow import MAX_ROWS, PlowExperiment
 from splatsoil.experiment.scene_parts import bins_of
 from splatsoil.files import write_text
@@ -57,6 +60,8 @@ ANGLE, SEED = 35.0, 1
 """Of the soil, degrees, and the seed of its surface, its looks and the cameras' noise."""
 TRUTH = {"friction_angle": ANGLE}
 HEIGHT = "height"
+HEIGHTS = GRIDS, DEPTH_MAPS = "grids", "depth-maps"
+"""Instruments of heights, as ``--heights`` names them."""
 
 
 class TrueSoil(PlowExperiment):
@@ -183,6 +188,38 @@ def changes_of(candidate: Candidate, noise: Noise, tables: Tables) -> FloatArray
     return np.asarray(noise.scores(found) - noise.base[[run.seed for run in runs]])
 
 
+def along_angle(noise: Noise, prior: Prior) -> FloatArray:
+    """(p,) what the angle changes, along the modes of the noise."""
+    at = prior.space.to_unit(prior.space.to_vector(TRUTH))[None]
+    trends = (trend_of(at + step, noise.points) for step in (0.01, -0.01))
+    return np.asarray((np.subtract(*trends) @ noise.base)[0])
+
+
+def by_instrument(
+    seen: tuple[PlowExperiment, Tables], prior: Prior, effects: Iterable[Candidate]
+) -> list[dict[str, Any]]:
+    """One row for each effect: its size, and the sigmas of (d) with some of the instruments and with all."""
+    experiment, tables = seen
+    placed = experiment.layout.placed
+    heights = np.array([site.channel == CHANNEL for site in experiment.layout.sites])
+    aside = {"pictures, force": heights, "heights, force": placed & ~heights, "all": np.zeros_like(heights)}
+    rows: list[dict[str, Any]] = [
+        {"effect": c.name, "parameter": c.size, "unit": c.measure.unit, "value": sized(c.measure, OBSERVATION_STEP)}
+        | {"sigmas": {}, "least": {}}
+        for c in effects
+        if c.kind == "observation" or c.name in tables.effects
+    ]
+    by_name = {c.name: c for c in effects}
+    for name, without in aside.items():
+        left_out = np.broadcast_to(without, experiment.layout.shape)
+        noise = noise_of(experiment, prior, tables, experiment.candidates, left_out)
+        precision = precision_of(noise.covariance(1.0), along_angle(noise, prior))
+        for row in rows:
+            found = sigmas(changes_of(by_name[row["effect"]], noise, tables), precision, 2.0 * noise.scatter)
+            row["sigmas"][name], row["least"][name] = found
+    return rows
+
+
 def left(
     true: tuple[TrueSoil, Tables], seen: tuple[PlowExperiment, Tables], prior: Prior, effects: Iterable[Candidate]
 ) -> list[dict[str, Any]]:
@@ -196,8 +233,7 @@ def left(
     views = {"soil": bare(*true, true[0].layout.placed & ~heights), "drawn": bare(*true, heights)}
     views["reconstructed"] = bare(*seen, np.array(False))
     whole = noise_of(seen[0], prior, seen[1], seen[0].candidates)
-    at = prior.space.to_unit(prior.space.to_vector(TRUTH))[None]
-    free = ((trend_of(at + 0.01, whole.points) - trend_of(at - 0.01, whole.points)) @ whole.base)[0]
+    free = along_angle(whole, prior)
     steps = {name: (noise, tables, precision_of(noise.fixed)) for name, (noise, tables) in views.items()}
     steps["angle"] = whole, seen[1], precision_of(views["reconstructed"][0].fixed, free)
     steps["observation"] = whole, seen[1], precision_of(whole.fixed, free)
@@ -221,34 +257,55 @@ def table(rows: Iterable[Mapping[str, Any]]) -> str:
     head = ("effect", "(a) heights, force", "(b) drawn", "(c) reconstructed", "(d) after nuisances", "loss", "most by")
     lines = []
     for row in sorted(rows, key=lambda row: ("soil" not in row["sigmas"], -row["loss"])):
+        text = in_words(row)
         hidden = {name: value < row["least"][name] for name, value in row["sigmas"].items()}
-        text = {n: f"< {row['least'][n]:.1f} σ" if hidden[n] else f"{v:.1f} σ" for n, v in row["sigmas"].items()}
         loss, most = f"{'≥ ' * hidden['discretisation']}{row['loss']:.1f}", max(row["factors"], key=row["factors"].get)
-        unit = "" if row["unit"] == "1" else " " + row["unit"].replace("deg", "°")
-        cells = [f"{row['effect'].replace('_', ' ')}, {row['value']:g}{unit}"]
-        cells += [text.get(name, "–") for name in ("soil", "drawn", "reconstructed", "discretisation")]
+        cells = [named(row), *(text.get(name, "–") for name in ("soil", "drawn", "reconstructed", "discretisation"))]
         cells += ["–", "–"] if next(iter(hidden.values())) else [loss, f"{most}: {row['factors'][most]:.1f}"]
         lines.append(cells)
     return markdown(head, lines)
 
 
-def measure(effects: Sequence[str], preset: str, seeds: int, device: str, out: Path) -> list[dict[str, Any]]:
-    """`left` of the effects of these names, or of all; what is not in the folder is made."""
+def table_of_instruments(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Markdown, what heights and forces contain most of first."""
+    ordered = sorted(rows, key=lambda row: -row["sigmas"]["heights, force"])
+    lines = [[named(row), *in_words(row).values()] for row in ordered]
+    return markdown(("effect", "pictures, force", "heights, force", "all"), lines)
+
+
+def named(row: Mapping[str, Any]) -> str:
+    """An effect and its size."""
+    unit = "" if row["unit"] == "1" else " " + row["unit"].replace("deg", "°")
+    return f"{row['effect'].replace('_', ' ')}, {row['value']:g}{unit}"
+
+
+def in_words(row: Mapping[str, Any]) -> dict[str, str]:
+    """A row's sigmas; what scatter alone could reach is a limit."""
+    least = row["least"]
+    return {n: f"< {least[n]:.1f} σ" if v < least[n] else f"{v:.1f} σ" for n, v in row["sigmas"].items()}
+
+
+def measure(
+    effects: Sequence[str], preset: str, seeds: int, device: str, out: Path, heights: str = ""
+) -> list[dict[str, Any]]:
+    """`left` of the effects of these names, or of all; of a set with ``heights`` (`HEIGHTS`), `by_instrument`. What is
+    not in the folder is made."""
     place, say = out / "set", Clock()
     if not (place / "truth.json").is_file():
-        make_set(place, plow(SEED), Recipe(ANGLE, preset=preset, seed=SEED, device=device))
+        recipe = Recipe(ANGLE, preset=preset, seed=SEED, device=device)
+        make_set(place, plow(SEED), replace(recipe, heights=heights == GRIDS, depth_maps=heights == DEPTH_MAPS))
     measurement = Measurement.load(place)
     reconstruction = reconstructed(measurement, out / "reconstruction", preset, device)
     known = replace(reconstruction, surface=plow(SEED).surface)
     prepared: list[Any] = []
-    for kind, start in ((TrueSoil, known), (PlowExperiment, reconstruction)):
+    for kind, start in ((TrueSoil, known), (PlowExperiment, reconstruction))[bool(heights) :]:
         experiment = kind(Model(measurement, start, preset=preset, device=device), TRUTH)
         wanted = [c for c in experiment.candidates if not effects or c.name in effects]
         ask = Simulations(experiment, out / "features", {"experiment": kind.__name__})
         ask.report = say
         prior = Prior.of(experiment, TRUTH)
         prepared.append((experiment, simulated(experiment, ask, prior, wanted, seeds, kind is PlowExperiment)))
-    return left(prepared[0], prepared[1], prior, wanted)
+    return by_instrument(prepared[0], prior, wanted) if heights else left(prepared[0], prepared[1], prior, wanted)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -258,16 +315,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--effects", nargs="+", default=[], choices=known, metavar="EFFECT", help="all by default")
     parser.add_argument("--preset", default="tiny", choices=sorted(PRESETS))
     parser.add_argument("--seeds", type=at_least(2), default=3, help="of the particles, with each effect")
+    parser.add_argument("--heights", default="", choices=HEIGHTS, help="the set has heights, too: what they give")
     options = parser.parse_args(arguments)
     hush()
-    mark = f"information {options.preset}"
+    mark = " ".join(["information", options.preset, *[options.heights] * bool(options.heights)])
     if options.page:
         with_section(options.page, mark, "")  # a page without a place for the table fails now, not at the end
     device, own = options.device.split(":")[0], sources("information")
-    keep_to_one_protocol(options.out, {"preset": options.preset, "device": device, "code": own})
-    rows = measure(options.effects, options.preset, options.seeds, options.device, options.out)
+    protocol = {"preset": options.preset, "device": device, "heights": options.heights, "code": own}
+    keep_to_one_protocol(options.out, protocol)
+    rows = measure(options.effects, options.preset, options.seeds, options.device, options.out, options.heights)
     result = {"made_by": stamp(options.device), "preset": options.preset, "seeds": options.seeds, **TRUTH, "rows": rows}
-    shown = f"Preset `{options.preset}`, {options.seeds} seeds.\n\n{table(rows)}"
+    shown = table_of_instruments(rows) if options.heights else table(rows)
+    shown = f"Preset `{options.preset}`, {options.seeds} seeds.\n\n{shown}"
     if options.page:
         write_text(options.page, with_section(options.page, mark, shown))
     tell(options, result, shown)

@@ -231,7 +231,7 @@ def plain(data: Any) -> Any:
 
 
 #: Parts of the package that decide what a reconstruction is, and what an evaluation comes to.
-RECONSTRUCTING = ("measurement", "splats", "reconstruction", "colour.py")
+RECONSTRUCTING = ("measurement", "splats", "mpm/presets.py", "reconstruction", "colour.py")
 FORWARD = (
     *RECONSTRUCTING,
     *("soil", "mpm", "scene", "parameters.py", "model.py", "observation.py"),

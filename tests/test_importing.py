@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from splatsoil import cli
 from splatsoil.errors import MeasurementError
-from splatsoil.importing.clock import Footage, clock_offset
+from splatsoil.importing.clock import Footage, clock_offset, late_cameras
 from splatsoil.importing.robot import Grid, read_force
 from splatsoil.importing.similarity import by_known_points, by_scale, read_marked
 from splatsoil.importing.source import read_source
@@ -691,3 +691,17 @@ def test_the_clock_of_a_box_that_crosses_the_picture() -> None:
 def test_no_clock_is_told_from_noise() -> None:
     with pytest.raises(MeasurementError, match="colours of what is behind it"):
         clock_offset(*([one] if isinstance(one, Footage) else one for one in footage(shown=False)))
+
+
+def test_a_video_on_another_clock_than_the_tools_is_known(plow_dry: Path) -> None:
+    """A real picture of the example set, on clocks that differ by more and by less than half a frame of 20 ms."""
+    given = Measurement.load(plow_dry)
+    frames = [f for f in given.video if f.camera_name == "left" and (f.frame or 0) >= 0][::2]
+
+    def late(seconds: float, video: list[Frame]) -> dict[str, float]:
+        shifted = tuple(replace(f, time=(f.time or 0.0) + seconds) for f in video)
+        return late_cameras(replace(given, video=shifted))
+
+    assert late(0.005, frames) == {}
+    assert late(-0.05, frames) == {"left": pytest.approx(0.05, abs=0.005)}
+    assert late(-0.05, frames[:3]) == {}, "too few to tell"

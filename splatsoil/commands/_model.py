@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import sys
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from splatsoil import __version__
 from splatsoil.commands._options import FitOptions, RunOptions, command_line, same_again
 from splatsoil.commands._output import Report, Stage, places, print_remarks, stages
 from splatsoil.envs.devices import resolve_device
-from splatsoil.errors import MeasurementError, NoAnswer, ParameterError, RunError
+from splatsoil.errors import MeasurementError, NoAnswer, ParameterError, RunError, SetWarning
 from splatsoil.files import CRITICISM, FORWARD, RECONSTRUCTING, code_digest, code_of, digest, own_files
 from splatsoil.inverse.run_folder import RunFolder
 from splatsoil.quiet import hush
@@ -192,8 +193,18 @@ def reconstructed(
 
     Raises:
         RunError: it is damaged, or missing and not to be made.
+        NoAnswer: photographs that were set aside rule it out; it is kept.
     """
-    from splatsoil.reconstruction import Reconstruction, reconstruct
+    found = _reconstructed(measurement, run, device, report, make=make)
+    if found.fault:
+        raise NoAnswer(f"no answer: {found.fault}: kept in {run.reconstruction}", places(run))
+    return found
+
+
+def _reconstructed(
+    measurement: Measurement, run: RunFolder, device: str, report: Report, *, make: bool
+) -> Reconstruction:
+    from splatsoil.reconstruction import Reconstruction
 
     settings = {"preset": run.description["preset"], "seed": run.description["seed"]}
     code = code_digest(RECONSTRUCTING)
@@ -208,11 +219,27 @@ def reconstructed(
             return stored
     if not make:
         raise RunError(f"{run.path}: its reconstruction isn't there")
-    made = reconstruct(measurement, device=device, progress=report, **settings)
+    made = new_reconstruction(measurement, device=device, progress=report, **settings)
     with run.lock():
         made.save(run.reconstruction)
     # Every later command starts from the float32 values on disk.
     return Reconstruction.load(run.reconstruction)
+
+
+def new_reconstruction(measurement: Measurement, **settings: Any) -> Reconstruction:
+    """A reconstruction by these settings of `reconstruct`, with a remark on each fixed camera whose clock is off."""
+    from splatsoil.importing.clock import late_cameras
+    from splatsoil.reconstruction import reconstruct
+
+    made = reconstruct(measurement, **settings)
+    late = [
+        f"video: Camera {name!r} sees the tool where it is {abs(offset):.3f} s {'later' if offset > 0.0 else 'earlier'}"
+        " than the camera's times; are they on the clock of the tool's motion?"
+        for name, offset in late_cameras(measurement).items()
+    ]
+    for remark in late:
+        warnings.warn(remark, SetWarning, stacklevel=2)
+    return replace(made, metadata={**made.metadata, "remarks": [*made.metadata["remarks"], *late]})
 
 
 def model_on(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from splatsoil.commands import _model
 from splatsoil.commands._options import PRESET, SEED, SET, Preset, check_seed
 from splatsoil.commands._output import print_remarks, print_result, print_table, print_text, stages
 from splatsoil.envs.devices import resolve_device
@@ -35,7 +36,6 @@ class Config:
 def run(config: Config) -> int:
     """Reconstruct, save and print; set, options and folder are checked first."""
     from splatsoil.measurement import Measurement
-    from splatsoil.reconstruction import reconstruct
 
     check_seed(config.seed)
     hush()
@@ -45,7 +45,7 @@ def run(config: Config) -> int:
     out = config.out or Path("runs") / f"{measurement.name}-reconstruction"
     check_folder(out)
     with stages(quiet=config.json) as begin:
-        result = reconstruct(
+        result = _model.new_reconstruction(
             measurement,
             seed=config.seed,
             device=device,
@@ -55,7 +55,8 @@ def run(config: Config) -> int:
         )
     result.save(out)
     data = {"set": str(measurement.folder), "out": str(out), **result.summary()}
-    return print_result(config, data, lambda: _show(result, out))
+    none = result.fault and f"no answer: {result.fault}"
+    return print_result(config, data, lambda: _show(result, out), none=none)
 
 
 def _show(result: Reconstruction, out: Path) -> None:

@@ -12,7 +12,7 @@ from PIL import Image
 
 from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError, ParameterError
-from splatsoil.importing.clock import WIDTH, ClockOffset, Footage, clock_offset, moving
+from splatsoil.importing.clock import LOOKED_AT, WIDTH, ClockOffset, Footage, clock_offset, moving
 from splatsoil.importing.options import ImportOptions
 from splatsoil.importing.robot import Grid, metres, read_force, read_motion, read_rigid, resampled
 from splatsoil.importing.similarity import (
@@ -36,8 +36,6 @@ from splatsoil.measurement.writer import Picture, whole_folder, write_frames, wr
 
 PRE_ROLL = 8
 """Frames before anything moves that are kept of a video, at most: they measure the noise."""
-LOOKED_AT = 60
-"""Images of each video that its clock is estimated from."""
 
 
 @dataclass(frozen=True)

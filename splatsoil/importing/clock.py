@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,9 +21,10 @@ from scipy.ndimage import map_coordinates
 
 from splatsoil.arrays import FloatArray
 from splatsoil.errors import MeasurementError
+from splatsoil.measurement import Measurement
 from splatsoil.measurement.camera import Camera
 from splatsoil.measurement.motion import ToolMotion
-from splatsoil.reconstruction.views import surface_points
+from splatsoil.reconstruction.views import load_views, surface_points
 
 WIDTH = 480
 """Pictures are halved until they are no wider, px."""
@@ -32,6 +34,8 @@ PLACES = 2000
 """On the tool, at least, whose colours are compared."""
 STEP = 0.25
 """Way of the tool, over its width, from one offset of the coarse search to the next."""
+LOOKED_AT = 60
+"""Images of each video that its clock is estimated from, at most."""
 RESTING = 0.01
 """Of the largest speed: a tool that is no faster rests."""
 LEAST_SHARE = 0.1
@@ -175,3 +179,27 @@ def clock_offset(footage: Sequence[Footage], mesh: trimesh.Trimesh, motion: Tool
         return float(result.x)
 
     return ClockOffset(refined(*cameras), tuple(refined(w) for w in cameras))
+
+
+def late_cameras(measurement: Measurement) -> dict[str, float]:
+    """Fixed cameras whose clock is not the tool's, and what is added to their times to get the tool's, s.
+
+    An offset counts from half a frame on, to which frame numbers tell times. Every other image must give the same one
+    as the images between them (split-half reliability), which needs two of each at least.
+    """
+    tool, tolerance, found = measurement.tool, 0.5 / measurement.frame_rate, {}
+    for name in measurement.cameras:
+        frames = [f for f in measurement.video if f.camera_name == name and (f.frame or 0) >= 0]
+        if len(frames) < 4:
+            continue
+        frames = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, LOOKED_AT).astype(int))]
+        halves = []
+        for part in (frames[::2], frames[1::2]):
+            views = load_views(part, WIDTH)
+            pictures = np.rint(255.0 * views.images.permute(0, 2, 3, 1).numpy()).astype(np.uint8)
+            footage = Footage(views.cameras[0], np.array([f.time or 0.0 for f in part]), pictures)
+            with suppress(MeasurementError):
+                halves.append(clock_offset([footage], tool.mesh, tool.motion).seconds)
+        if len(halves) == 2 and np.abs(halves).min() > tolerance > np.ptp(halves):
+            found[name] = float(np.mean(halves))
+    return found

@@ -15,6 +15,7 @@ from splatsoil import __version__
 from splatsoil.errors import MeasurementError, ParameterError
 from splatsoil.files import RECONSTRUCTING, code_digest
 from splatsoil.measurement import BIN, HEAP, TRANSPARENT, Bed, Measurement
+from splatsoil.mpm.presets import Resolution
 from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.heights import first_surface
 from splatsoil.reconstruction.hidden import reaching_into_soil
@@ -157,7 +158,8 @@ def reconstruct(
             for camera, value in zip(cameras, apart, strict=True)
             if value > RESOLVED
         ]
-    held_out = judged(scene, every.subset(aside), trained.background)
+    cell = Resolution.derive(measurement, preset).cell
+    held_out = judged(scene, every.subset(aside), trained.background, cell)
     made = Reconstruction(
         gaussians=gaussians,
         soil=soil,
@@ -170,6 +172,7 @@ def reconstruct(
             **about,
             "container": container,
             "ground": geometry.ground,
+            "simulation_cell": cell,
             "first_loss": float(np.mean(trained.losses[: len(views)])),
             "last_loss": float(np.mean(trained.losses[-len(views) :])),
             "remarks": remarks,
@@ -218,21 +221,29 @@ def at_sides(gaussians: Gaussians, label: torch.Tensor, surface: HeightField, be
     return torch.from_numpy(near & high)
 
 
-def judged(gaussians: Gaussians, views: Views, background: tuple[float, float, float]) -> tuple[HeldOut, ...]:
-    """Likeness of the drawn pictures to photographs that were set aside (pixels that are masked do not count).
+def judged(
+    gaussians: Gaussians, views: Views, background: tuple[float, float, float], displacement: float
+) -> tuple[HeldOut, ...]:
+    """Likeness of the drawn pictures to photographs that were set aside (pixels that are masked do not count), and of
+    the same pictures to those of the scene higher by ``displacement`` metres.
 
     A photograph of which nothing is left tells nothing and is left out.
     """
+    raised = replace(gaussians, means=gaussians.means + gaussians.means.new_tensor([0.0, 0.0, displacement]))
     result = []
     for k, camera in enumerate(views.cameras):
         if not views.valid[k].any():
             continue
         photograph = views.photograph(k).contiguous().to(gaussians.device)
         valid = views.valid[k, : camera.height, : camera.width, None].to(gaussians.device)
+        unmasked = 10.0 * np.log10(float(valid.mean()))
         with torch.no_grad():
-            seen = rasterise(gaussians, camera, background=background, antialias=True)
-            mixed = seen.colour.clamp(0.0, 1.0) * valid + photograph * (1.0 - valid)
-            share = float(valid.mean())
-            value = float(psnr(mixed, photograph) + 10.0 * np.log10(share))
-            result.append(HeldOut(views.names[k], value, float(ssim(mixed, photograph))))
+            drawn, higher = (
+                rasterise(g, camera, background=background, antialias=True).colour.clamp(0.0, 1.0)
+                for g in (gaussians, raised)
+            )
+            mixed = drawn * valid + photograph * (1.0 - valid)
+            value = float(psnr(mixed, photograph) + unmasked)
+            displaced = float(psnr(higher * valid, drawn * valid) + unmasked)
+            result.append(HeldOut(views.names[k], value, float(ssim(mixed, photograph)), displaced))
     return tuple(result)

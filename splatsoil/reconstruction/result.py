@@ -31,11 +31,13 @@ class HeldOut:
         name: the photograph's file name.
         psnr: peak signal-to-noise ratio, dB.
         ssim: structural similarity, 1 is perfect.
+        displaced: PSNR between what is drawn and the same with the scene a cell of the simulation higher, dB.
     """
 
     name: str
     psnr: float
     ssim: float
+    displaced: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +91,24 @@ class Reconstruction:
     def ssim(self) -> float:
         """Mean over the photographs that were set aside; NaN if there are none."""
         return float(np.mean([view.ssim for view in self.held_out])) if self.held_out else float("nan")
+
+    @property
+    def fault(self) -> str:
+        """Why photographs that were set aside rule the reconstruction out, in one clause; empty where they do not.
+
+        They must be predicted better than an error of a cell of the simulation, which is what it resolves, would allow.
+        """
+        if not self.held_out:
+            return ""
+        displaced = float(np.mean([view.displaced for view in self.held_out]))
+        if not self.psnr < displaced:
+            return ""
+        cell = 1e3 * float(self.metadata["simulation_cell"])
+        return (
+            f"photographs set aside are predicted to {self.psnr:.1f} dB only, as if the soil lay more than a cell of"
+            f" the simulation ({cell:.3g} mm, {displaced:.1f} dB) from where it is; poses or lenses of the views are"
+            " wrong, or photographs are blurred or of different scenes"
+        )
 
     def say_remarks(self) -> None:
         """Warn of what was odd about the set when it was reconstructed."""
@@ -155,7 +175,10 @@ class Reconstruction:
                 surface=HeightField(**_load_npz(source / "surface.npz")),
                 mesh=trimesh.load_mesh(source / "soil.ply", process=False),
                 background=(float(red), float(green), float(blue)),
-                held_out=tuple(HeldOut(v["name"], _number(v["psnr"]), _number(v["ssim"])) for v in facts["held_out"]),
+                held_out=tuple(
+                    HeldOut(v["name"], *(_number(v.get(key)) for key in ("psnr", "ssim", "displaced")))
+                    for v in facts["held_out"]
+                ),
                 seconds=float(facts["seconds"]),
             )
             out = replace(out, metadata={k: v for k, v in facts.items() if k not in out.summary()})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from splatsoil.reconstruction import HeightField, Reconstruction, reconstruct
 from splatsoil.reconstruction.hidden import reaching_into_soil
 from splatsoil.reconstruction.initial import SOIL, Seeds, discs
 from splatsoil.reconstruction.likeness import Likeness, displacements, likeness
+from splatsoil.reconstruction.pipeline import judged
 from splatsoil.reconstruction.surface import surface_through
 from splatsoil.reconstruction.views import load_views
 from splatsoil.splats import load_ply, rasterise
@@ -225,6 +227,37 @@ def test_views_that_tell_no_height_are_refused(measurement):
         far.append(replace(view, camera=replace(view.camera, camera_to_world=pose)))
     with pytest.raises(MeasurementError, match="from nearer"):
         reconstruct(replace(measurement, views=tuple(far)), preset="tiny")
+
+
+def test_photographs_set_aside_that_are_not_predicted_leave_no_answer(measurement, result, tmp_path, capsys):
+    """Two photographs have the poses of one another."""
+    assert result.fault == ""
+    folder = tmp_path / "set"
+    shutil.copytree(measurement.folder, folder)
+    file = folder / "views" / "transforms.json"
+    data = json.loads(file.read_text())
+    one, other = (data["frames"][k] for k in (0, 8))
+    one["file_path"], other["file_path"] = other["file_path"], one["file_path"]
+    file.write_text(json.dumps(data))
+    run = tmp_path / "run"
+    words = ["--preset", "tiny", "--device", "cpu"]
+    assert main(["fit", str(folder), "--run", str(run), *words]) == 3
+    out = capsys.readouterr().out
+    assert out.startswith("no answer: photographs set aside are predicted to") and len(out.splitlines()) == 1
+    assert (run / "reconstruction" / "reconstruction.json").is_file() and not (run / "fit.json").exists()
+    assert main(["reconstruct", str(folder), "--out", str(tmp_path / "out"), *words, "--json"]) == 3
+    said = json.loads(capsys.readouterr().out)
+    assert said["ok"] is False and said["error"].startswith("no answer: photographs set aside")
+
+
+def test_what_photographs_set_aside_must_be_nearer_than(measurement, result):
+    """To the scene higher by a length: nothing for none, and the more the longer it is."""
+    views = load_views(measurement.views[:2], 160)
+    nothing, little, much = (
+        [one.displaced for one in judged(result.gaussians, views, result.background, length)]
+        for length in (0.0, 0.002, 0.02)
+    )
+    assert np.isinf(nothing).all() and (np.array(little) > np.array(much) + 3.0).all()
 
 
 def test_without_photographs_to_judge_by_there_is_no_likeness(measurement, tmp_path, capsys):
