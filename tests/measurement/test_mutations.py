@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import HealthCheck, example, given, note, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -321,13 +321,13 @@ def checked(base: Path, mutations: list[Mutation], as_json: bool, command: Seque
     assert code in (0, 2)
     assert not [w for w in warned if not issubclass(w.category, DeprecationWarning)], "nothing else on stderr"
     if code == 2:
-        note(err.getvalue())
+        print(err.getvalue())
         said = [line for line in err.getvalue().splitlines(keepends=True) if not line.startswith("remark ")]
         sentence = "".join(said).removeprefix("splatsoil: ")
         assert sentence.startswith(str(folder)), "names the file"
         assert sentence.count("\n") == 1 and len(sentence) < 1000, "one sentence"
     if as_json:
-        note(out.getvalue())
+        print(out.getvalue())
         assert json.loads(out.getvalue(), parse_constant=pytest.fail)["ok"] == (code == 0)
     else:
         out.getvalue().encode()
