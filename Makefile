@@ -5,6 +5,7 @@
 #   make test-slow  the tests that take minutes: whole reconstructions and simulations of the example sets
 #   make mutants  small faults in the source, one at a time, and which of them no test sees; an hour
 #   make lint     formatting, lint, unused code and types
+#   make audit    known vulnerabilities of the installed packages, and the tests with the oldest ones that are allowed
 #   make readme   docs/readme.webp, the README's picture, from the run of make demo
 #   make docs     the documentation as a site, build/site/index.html
 #   make clean    remove what these made, the virtual environment included; runs/ stays
@@ -26,7 +27,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 PACKAGES := splatsoil envs inverse benchmarks
 SOURCES := $(shell find $(PACKAGES) -type f -not -path '*/__pycache__/*')
 
-.PHONY: demo test test-slow mutants lint readme docs clean
+.PHONY: demo test test-slow mutants lint audit readme docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.use
@@ -48,6 +49,13 @@ lint: $(VENV)/.develop build/installed/.stamp
 	$(BIN)/ruff check $(PACKAGES) tests examples mkdocs_hooks.py
 	$(BIN)/vulture
 	cd build/installed && "$(abspath $(BIN))/mypy" --config-file "$(CURDIR)/pyproject.toml" -p splatsoil
+
+audit: $(VENV)/.develop
+	$(PIP) install --quiet pip-audit uv
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python build/oldest
+	$(BIN)/uv pip install --quiet --python build/oldest/bin/python --resolution lowest-direct --editable '.[dev]'
+	OMP_NUM_THREADS=1 build/oldest/bin/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/pip-audit --skip-editable
 
 readme: demo
 	$(BIN)/splatsoil benchmark readme runs/demo docs/readme.webp

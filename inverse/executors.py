@@ -5,7 +5,9 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import InvalidStateError, ProcessPoolExecutor
+from contextlib import contextmanager
 
 from splatsoil.errors import ParameterError
 from splatsoil.threads import cores
@@ -30,10 +32,27 @@ def processes(workers: int) -> ProcessPoolExecutor:
 
 def kill(pool: ProcessPoolExecutor) -> None:
     """End the workers, and all other child processes, at once."""
-    pool.shutdown(wait=False, cancel_futures=True)
-    for child in multiprocessing.active_children():
-        child.terminate()
-    pool.shutdown()
+    with _quietly_broken():
+        for child in multiprocessing.active_children():
+            child.terminate()
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _quietly_broken() -> Iterator[None]:
+    """The thread of a pool that loses its workers while work that was cancelled waits ends by an error in Python before
+    3.13, which it would print."""
+    usual = threading.excepthook
+
+    def hook(given: threading.ExceptHookArgs) -> None:
+        if not issubclass(given.exc_type, InvalidStateError):
+            usual(given)
+
+    threading.excepthook = hook
+    try:
+        yield
+    finally:
+        threading.excepthook = usual
 
 
 def _begin(threads: str) -> None:

@@ -39,7 +39,7 @@ def write_bytes(path: str | Path, data: bytes) -> Path:
         target.parent.mkdir(parents=True, exist_ok=True)
         descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent)
     except OSError as error:
-        raise RunError(f"{target}: cannot be written ({error.strerror}); choose a folder you may write to") from error
+        raise _unwritable(target, error) from error
     try:
         with os.fdopen(descriptor, "wb") as stream:
             stream.write(data)
@@ -53,9 +53,15 @@ def write_bytes(path: str | Path, data: bytes) -> Path:
     except BaseException as error:
         Path(name).unlink(missing_ok=True)
         if isinstance(error, OSError):
-            raise RunError(f"{target}: cannot be written ({error.strerror}); free some space and try again") from error
+            raise _unwritable(target, error) from error
         raise
     return target
+
+
+def _unwritable(path: str | Path, error: OSError) -> RunError:
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    advice = "free some space and try again" if full else "choose a folder you may write to"
+    return RunError(f"{path}: cannot be written ({error.strerror}); {advice}")
 
 
 def check_paths(values: Iterable[Any]) -> None:
@@ -94,7 +100,7 @@ def check_folder(path: str | Path) -> None:
         with tempfile.TemporaryDirectory(dir=there):
             pass
     except OSError as error:
-        raise RunError(f"{path}: cannot be written ({error.strerror}); choose a folder you may write to") from None
+        raise _unwritable(path, error) from None
 
 
 def write_text(path: str | Path, text: str) -> Path:

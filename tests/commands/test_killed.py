@@ -29,9 +29,10 @@ CLOCKS = {"seconds", "created", "simulated_now"}
 QUICK = ("--preset", "tiny", "--budget", "2", "--device", "cpu")
 WHOLE = ("--preset", "tiny", "--budget", "2", "--no-effects", "--device", "cpu")
 
-#: Runs the program and kills it at a certain one of the moments at which it touches a file of a folder.
+#: Runs the program and kills it at a certain one of the moments at which it touches a file of a folder; by a negative
+#: number, the disk is full from then on.
 KILLER = """
-import os, signal, sys
+import errno, os, signal, sys
 folder, moment = os.path.abspath(sys.argv[1]), int(sys.argv[2])
 seen = 0
 def touched(event, given):
@@ -42,6 +43,8 @@ def touched(event, given):
             seen += 1
             if seen == moment:
                 os.kill(os.getpid(), signal.SIGKILL)
+            if 0 < -moment <= seen and event in ("open", "os.mkdir"):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), given[0])
 sys.addaudithook(touched)
 from splatsoil.cli import main
 code = main(sys.argv[3:])
@@ -118,6 +121,23 @@ def test_a_fit_killed_while_it_writes_comes_to_the_same_end(place: Path) -> None
     assert timeless(again) | {"run": ""} == timeless(printed) | {"run": ""}
     whole, killed = essence(place / "quick"), essence(place / "quick-killed")
     assert without_places(killed) == without_places(whole)
+
+
+@pytest.mark.slow
+def test_a_full_disk_is_named_and_the_fit_comes_to_the_same_end(place: Path) -> None:
+    """At five moments, one after the other."""
+    words = ("fit", *QUICK)
+    printed, touched = finish(place, words, run="roomy")
+    for moment in sorted(random.Random(0).sample(range(2, touched), 5)):
+        process = start(place, words, run="full", moment=-moment)
+        out, err = process.communicate(timeout=600)
+        if process.returncode == 0:  # kept evaluations need fewer files
+            continue
+        said = err.splitlines()[-2]  # before the number of moments
+        assert process.returncode == 2 and said.startswith("splatsoil: ") and "No space left" in said, err
+        assert "Traceback" not in err and json.loads(out)["ok"] is False
+    again, _ = finish(place, words, run="full")
+    assert timeless(again) | {"run": ""} == timeless(printed) | {"run": ""}
 
 
 def without_places(result: dict[str, Any]) -> dict[str, Any]:
@@ -213,9 +233,10 @@ def test_files_cut_short_are_made_anew_or_named(whole: Path, command: Callable[.
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [int(os.environ.get("SPLATSOIL_FLIP_SEED", "0"))])
 def test_flipped_bits_are_named_or_do_no_harm(whole: Path, command: Callable[..., str], seed: int) -> None:
-    """One bit of each kind of file; one of the letters of a key where it holds any, so that it can still be read."""
-    chance = random.Random(seed)
-    for name in kinds(whole):
+    """One bit of every file in turn; one of the letters of a key where it holds any, so that it can still be read. What
+    takes long is done with one file of each kind."""
+    chance, first = random.Random(seed), kinds(whole)
+    for name in sorted(p.relative_to(whole) for p in whole.rglob("*") if p.is_file()):
         contents = bytearray((whole / name).read_bytes())
         keys = [found.start(1) for found in re.finditer(rb'"([a-z_]+)":', contents)] if name.suffix == ".json" else []
         read_by_fits = name.parts[0] in ("features", "evaluations.db", "fit.json")
@@ -223,9 +244,9 @@ def test_flipped_bits_are_named_or_do_no_harm(whole: Path, command: Callable[...
             flipped = contents.copy()
             flipped[chance.choice(places)] ^= 1 << chance.randrange(8 if places is not keys else 3)
             said = [command("report damaged", name, bytes(flipped))]
-            for words in ("compare damaged --quick", "export damaged --to csv"):
+            for words in ("compare damaged --quick", "export damaged --to csv") if name in first else ():
                 said.append(command(words, name))
-            if read_by_fits:
+            if read_by_fits and name in first:
                 said.append(command("posterior damaged --checks 0", name))
             assert all("damaged" in sentence for sentence in said if sentence), (name, said)
 

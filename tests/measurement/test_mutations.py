@@ -327,7 +327,6 @@ def checked(base: Path, mutations: list[Mutation], as_json: bool, command: Seque
         assert sentence.startswith(str(folder)), "names the file"
         assert sentence.count("\n") == 1 and len(sentence) < 1000, "one sentence"
     if as_json:
-        print(out.getvalue())
         assert json.loads(out.getvalue(), parse_constant=pytest.fail)["ok"] == (code == 0)
     else:
         out.getvalue().encode()
