@@ -90,7 +90,7 @@ def regions_of(
     soil."""
     tool, rate = measurement.tool, measurement.frame_rate
     place = np.array([[site.x, site.y] for site in sites])
-    # Trimesh.sample takes no seed before trimesh 4.9.
+    # Trimesh.sample takes no seed in trimesh 4.8 and older.
     points = np.asarray(trimesh.sample.sample_surface(tool.mesh, SURFACE_POINTS, seed=0)[0], dtype=np.float64)
     width = float(np.sort(tool.mesh.extents)[1])
     moments = np.unique(np.concatenate([np.arange(0.0, max(frames) + 1.0, 2.0), frames]))
