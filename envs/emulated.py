@@ -23,7 +23,7 @@ class EmulatedProblem(HiddenTruth):
         ParameterError: others.
     """
 
-    def __init__(self, parameters: Sequence[str] = ("friction_angle",), effects: Sequence[str] = ()) -> None:
+    def __init__(self, parameters: Sequence[str] | None = None, effects: Sequence[str] = ()) -> None:
         super().__init__(parameters, effects)
         known = {(free, on): name for name, (free, on, _) in GUESSED.items()}
         name = known.get((self.space.names, self.effects))

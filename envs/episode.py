@@ -71,9 +71,14 @@ class EpisodeEnv(gym.Env[Observed, Array]):
             info |= self.outcome()
         return self._observation(), reward, False, self._left == 0, info
 
+    @property
+    def over(self) -> bool:
+        """Whether the episode has ended, or none has begun."""
+        return self._left <= 0
+
     def accepted(self, action: Array) -> Array:
         """An action (n,) as it counts."""
-        if self._left <= 0:
+        if self.over:
             raise gym.error.ResetNeeded("the budget of steps is spent; call reset() to start another episode")
         given, space = np.array(action, dtype=np.float32).reshape(-1), self.action_space
         if given.shape != space.shape or not np.all(np.isfinite(given)):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splatsoil.parameters import ParameterSpace
+from splatsoil.quiet import hush
 
 from .devices import resolve_device
 from .problem import Evaluation, FloatArray, Image
@@ -46,7 +47,7 @@ class MeasuredProblem:
     def load(
         cls,
         measurement: str | Path,
-        parameters: Sequence[str] = ("friction_angle",),
+        parameters: Sequence[str] | None = None,
         effects: Sequence[str] = (),
         *,
         preset: str = "small",
@@ -57,7 +58,7 @@ class MeasuredProblem:
 
         Args:
             measurement: folder of the set.
-            parameters: names of the free parameters.
+            parameters: names of the free parameters; None: friction angle and strengths of the effects.
             effects: names of effects that are on.
             preset: resolution of the solver, and of the reconstruction if one has to be made.
             device: ``auto``, ``cpu`` or ``cuda:N``.
@@ -72,6 +73,7 @@ class MeasuredProblem:
         from splatsoil.model import Model
         from splatsoil.reconstruction import Reconstruction
 
+        hush()
         device = resolve_device(device)
         measured = Measurement.load(measurement)
         if reconstruction is None:

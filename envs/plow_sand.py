@@ -50,7 +50,7 @@ class PlowSandEnv(EpisodeEnv[Observation]):
     Args:
         measurement: folder of a measurement set. None: a small synthetic experiment with a hidden friction angle,
             drawn at ``reset(seed=...)``, which ``info["truth"]`` reveals at the end of the episode.
-        parameters: names of the free parameters.
+        parameters: names of the free parameters. None: friction angle and strengths of the effects that are on.
         effects: names of the effects that are on.
         preset: resolution of the solver; by default ``small`` for a measurement, ``tiny`` for the synthetic one.
         budget: evaluations in an episode, at least 2.
@@ -68,7 +68,7 @@ class PlowSandEnv(EpisodeEnv[Observation]):
     def __init__(
         self,
         measurement: str | None = None,
-        parameters: Sequence[str] = ("friction_angle",),
+        parameters: Sequence[str] | None = None,
         effects: Sequence[str] = (),
         preset: str | None = None,
         budget: int = 10,
@@ -203,7 +203,7 @@ class PlowSandEnv(EpisodeEnv[Observation]):
 
 def _problem(
     measurement: str | None,
-    parameters: Sequence[str],
+    parameters: Sequence[str] | None,
     effects: Sequence[str],
     preset: str | None,
     device: str,

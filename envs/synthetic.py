@@ -76,6 +76,7 @@ class HiddenTruth(ABC):
 
     Args:
         parameters: names of the free parameters, whose hidden values are drawn at ``begin``; the rest have defaults.
+            None: those that a fit frees, friction angle and strengths of the effects.
         effects: names of effects that are on, in the experiment and in the model.
 
     Raises:
@@ -87,7 +88,7 @@ class HiddenTruth(ABC):
     image_size = (HEIGHT, WIDTH)
     block_count = 2 * len(COMPARED) * BLOCKS[0] * BLOCKS[1]
 
-    def __init__(self, parameters: Sequence[str] = ("friction_angle",), effects: Sequence[str] = ()) -> None:
+    def __init__(self, parameters: Sequence[str] | None = None, effects: Sequence[str] = ()) -> None:
         from splatsoil.soil.law import Law
         from splatsoil.soil.library import find_effects
 
@@ -98,6 +99,7 @@ class HiddenTruth(ABC):
                 f"the synthetic experiment has no {seen[0]}: it is seen as it is; give a measurement set"
             )
         known = {p.name: p for p in law.parameters}
+        parameters = law.free if parameters is None else parameters
         unknown = [name for name in parameters if name not in known]
         if unknown:
             raise ParameterError(f"unknown parameter {', '.join(unknown)}; this model has {', '.join(known)}")
@@ -151,7 +153,7 @@ class SyntheticProblem(HiddenTruth):
 
     def __init__(
         self,
-        parameters: Sequence[str] = ("friction_angle",),
+        parameters: Sequence[str] | None = None,
         effects: Sequence[str] = (),
         *,
         preset: str = "tiny",

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatsoil.errors import SimulationError
+from splatsoil.quiet import hush
 
 from .problem import Image, Job, simulation_seed
 
@@ -115,6 +116,7 @@ class SyntheticExperiment:
         from splatsoil.soil.law import Law
         from splatsoil.soil.library import find_effects
 
+        hush()
         self.measurement = measurement_of(stroke or Stroke())
         self.cameras = cameras()
         self.law = Law(find_effects(effects))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import sys
+import textwrap
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, TextIO
 
 from splatsoil.errors import NoAnswer
@@ -157,6 +159,15 @@ def print_text(*paragraphs: str, style: str = "", notes: Iterable[str] = ()) -> 
         console.print(Text(paragraph), style=style)
     for note in notes:
         console.print(Text.assemble(("note", "yellow"), f" {note}"))
+
+
+def print_rows(rows: Iterable[tuple[str, str]]) -> None:
+    """Print labels and wrapped texts in two columns."""
+    from rich.console import Console
+
+    for label, words in rows:
+        lines = textwrap.wrap(words, max(Console().width - 22, 20))
+        print(*(f"  {name:<18}  {line}" for name, line in zip_longest([label], lines, fillvalue="")), sep="\n")
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatsoil import report
 from splatsoil.commands import _model, _stages
-from splatsoil.commands._options import BUDGET, ComputingOptions, FitOptions, check_evaluations
+from splatsoil.commands._options import BUDGET, ComputingOptions, FitOptions, check_evaluations, command_line
 from splatsoil.commands._output import Stage, print_result, print_table
 from splatsoil.errors import ParameterError, RunError
 from splatsoil.files import write_json
@@ -71,7 +71,8 @@ def run(config: Config) -> int:
     write_history(folder, models)
     _model.require_answer(folder, folder.fit(), f"report: {page}")
     data = {"report": str(page), "models": models}
-    return print_result(config, data, lambda: show(models), last=f"report: {page}", run=folder)
+    last = f"report: {page}\nIs anything else missing? {command_line('diagnose', folder.path)}"
+    return print_result(config, data, lambda: show(models), last=last, run=folder)
 
 
 def history(folder: RunFolder) -> dict[str, Any]:

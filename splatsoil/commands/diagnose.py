@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from splatsoil.commands import _laboratory, _model, _stages, _workers
-from splatsoil.commands._options import ComputingOptions
+from splatsoil.commands._options import ComputingOptions, command_line
 from splatsoil.commands._output import print_result, print_table, print_text
 from splatsoil.files import plain
 from splatsoil.options import option
@@ -45,8 +45,17 @@ def run(config: Config) -> int:
         with _model.loaded(config, folder) as (model, begin):
             result = _stages.run_diagnosis(folder, model, begin, config.effects, workers=workers)
     result = {key: value for key, value in result.items() if not (none and key == "estimates")}
-    kept = f"kept in {folder.path / 'diagnosis.json'}"
-    return print_result(config, plain(result), lambda: show(result), last=kept, run=folder, none=none)
+    last = f"kept in {folder.path / 'diagnosis.json'}\n{_next(result, str(folder.path))}"
+    return print_result(config, plain(result), lambda: show(result), last=last, run=folder, none=none)
+
+
+def _next(result: Mapping[str, Any], run: str) -> str:
+    """The command that goes on from a verdict."""
+    if result["verdict"] == "adequate":
+        return f"The page: {command_line('report', run)}"
+    if result["verdict"] in ("missing", "one of"):
+        return f"Does it explain the data? {command_line('add', run, result['class'][0])}"
+    return f"Which stroke would tell? {command_line('design', run)}"
 
 
 def show(result: Mapping[str, Any]) -> None:

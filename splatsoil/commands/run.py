@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from splatsoil import report
-from splatsoil.commands import _model, _stages, add, compare, diagnose, fit
+from splatsoil.commands import _model, _stages, add, compare
 from splatsoil.commands._options import FitOptions, command_line
-from splatsoil.commands._output import Stage, print_result, stages
+from splatsoil.commands._output import Stage, print_result, print_rows, print_text, stages
 from splatsoil.errors import ParameterError, SplatsoilError
 from splatsoil.files import plain, read_json
 from splatsoil.inverse.run_folder import RunFolder
 from splatsoil.options import option
-from splatsoil.report.text import called_adequate
+from splatsoil.report.data import load
+from splatsoil.report.summary import headline, rows
 
 if TYPE_CHECKING:
     from splatsoil.model import Model
@@ -69,17 +70,24 @@ def run(config: Config) -> int:
         data |= {"diagnosis": plain({key: diagnosis[key] for key in DIAGNOSIS}), "models": models, "stopped": stopped}
 
     def show() -> None:
-        fit.show(result, str(folder.path))
-        compare.show(comparison, str(folder.comparison), called_adequate(result, diagnosis or misfit))
-        if models:
+        told = load(folder.path)
+        print_text(headline(told), style="bold")
+        print()
+        print_rows(rows(told))
+        print()
+        if len(models) > 1:
             add.show(models)
+        # Not wrapped, so that they can be pasted.
+        print("  page   ", page)
+        print("  numbers", folder.path / "fit.json")
+        print("  look   ", command_line("view", folder.path))
+        print("  details", command_line("compare", folder.path))
         if diagnosis is not None:
-            diagnose.show(diagnosis)
-            print(f"Stopped because {stopped}.")
+            print_text(f"Stopped because {stopped}.")
         elif misfit is not None:
-            compare.show_misfit(misfit, str(folder.path))
+            print("  effects", command_line("diagnose", folder.path))
 
-    return print_result(config, {**data, **result}, show, last=f"report: {page}", run=folder)
+    return print_result(config, {**data, **result}, show, run=folder)
 
 
 def add_missing(folder: RunFolder, model: Model, most: int, begin: Stage) -> tuple[dict[str, Any], str]:

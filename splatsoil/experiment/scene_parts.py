@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+import trimesh
 
 from splatsoil.arrays import FloatArray
 from splatsoil.experiment.features import Site
@@ -89,7 +90,8 @@ def regions_of(
     soil."""
     tool, rate = measurement.tool, measurement.frame_rate
     place = np.array([[site.x, site.y] for site in sites])
-    points = np.asarray(tool.mesh.sample(SURFACE_POINTS, seed=0), dtype=np.float64)
+    # Trimesh.sample takes no seed in trimesh 4.8 and older.
+    points = np.asarray(trimesh.sample.sample_surface(tool.mesh, SURFACE_POINTS, seed=0)[0], dtype=np.float64)
     width = float(np.sort(tool.mesh.extents)[1])
     moments = np.unique(np.concatenate([np.arange(0.0, max(frames) + 1.0, 2.0), frames]))
     nearest = np.full(len(sites), np.inf)

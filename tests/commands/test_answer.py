@@ -74,3 +74,25 @@ def test_json_names_run_and_set(
     assert cli.main(words(command, run, "--json")) == 0
     printed = json.loads(capsys.readouterr().out)
     assert (printed["run"], printed["set"]) == (str(run.path), run.description["measurement"]["folder"])
+
+
+@pytest.mark.parametrize(
+    ("verdict", "named", "follows"),
+    [("adequate", [], "report"), ("one of", ["cohesion", "tilt"], "add"), ("undecided", [], "design")],
+)
+def test_a_diagnosis_and_an_addition_name_the_next_command(
+    run: RunFolder,
+    results: dict[str, Any],
+    capsys: pytest.CaptureFixture[str],
+    words: Words,
+    verdict: str,
+    named: list[str],
+    follows: str,
+) -> None:
+    run.write_fit("base", results["run_fit"])
+    results["run_diagnosis"] |= {"verdict": verdict, "class": named}
+    assert cli.main(words("diagnose", run)) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.endswith(" ".join([f"splatsoil {follows} '{run.path}'", *named[:1]]))
+    assert cli.main(words("add", run)) == 0
+    assert capsys.readouterr().out.splitlines()[-1].endswith(f"splatsoil diagnose '{run.path}'")

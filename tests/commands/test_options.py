@@ -27,7 +27,7 @@ from splatsoil.options import argument, option
 GIVEN = {
     "add": "'a run' cohesion 'my effects/crust.py' --set 'a set' --budget 9 --device cpu --json",
     "benchmark": "--json",
-    "check": "'my set' --json",
+    "check": "'my set' --pictures 'drawn over' --json",
     "compare": "'a run' --set 'a set' --quick --device cpu --json",
     "design": "'a run' --set 'a set' --draws 5 --preset small --device cpu --json",
     "diagnose": "'a run' --set 'a set' --effects cohesion 'my effects/crust.py' --device cpu --json",

@@ -42,6 +42,24 @@ def test_the_module_prefix_registers_it_in_a_fresh_interpreter_and_again_changes
     assert gym.registry["PlowSand-v0"] is before
 
 
+def test_effects_that_are_on_are_hidden_and_free() -> None:
+    """Their defaults are off: on alone, they would do nothing."""
+    problem = PlowSandEnv(effects=["cohesion", "dilatancy"]).problem
+    assert problem.space.names == ("friction_angle", "cohesion", "dilatancy_angle")
+    problem.begin(0)
+    truth = problem.truth()
+    assert truth is not None and truth["cohesion"] > 0.0 and truth["dilatancy_angle"] > 0.0
+
+
+def test_a_step_prints_nothing() -> None:
+    script = (
+        "import gymnasium as gym\nenv = gym.make('splatsoil:PlowSand-v0')\n"
+        "env.reset(seed=0)\nenv.step(env.action_space.sample())"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=True)
+    assert (done.stdout, done.stderr) == ("", "")
+
+
 def test_check_env_is_clean_and_the_spec_survives_json() -> None:
     env = gym.make("PlowSand-v0", budget=4, render_mode="rgb_array")
     with warnings.catch_warnings():

@@ -32,7 +32,7 @@ def test_a_batch_of_simulations_is_what_single_ones_are() -> None:
 
 def test_episodes_begin_anew_in_the_step_that_ends_them_and_fail_alone(analytic: ModuleType) -> None:
     problems = [analytic.AnalyticProblem(truth=t, fails_below=b) for t, b in ((30.0, 0.0), (40.0, 36.0))]
-    batch = PlowSandVectorEnv(2, budget=2, problems=problems)
+    batch = PlowSandVectorEnv(2, budget=2, problems=problems, autoreset_mode="SameStep")
     batch.reset(seed=[7, 8])
     *_, infos = batch.step(np.zeros((2, 1), np.float32))
     assert list(infos["status"]) == ["ok", "failed"]
@@ -57,6 +57,26 @@ def test_emulated_episodes_side_by_side_are_the_single_ones() -> None:
         single = gym.make("PlowSandSeveralFast-v0")
         single.reset(seed=4 + k)
         assert single.step(np.zeros(3, np.float32))[1] == reward
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_episodes_begin_anew_as_in_gymnasiums_own_vector(mode: str) -> None:
+    """And by default in the same mode."""
+    options: dict = {"num_envs": 2, "budget": 2}
+    batch = gym.make_vec("PlowSandFast-v0", autoreset_mode=mode, **options)
+    kwargs = {"vectorization_mode": "sync", "vector_kwargs": {"autoreset_mode": mode}}
+    theirs = gym.make_vec("PlowSandFast-v0", **options, **kwargs)
+    default = gym.make_vec("PlowSandFast-v0", **options).metadata["autoreset_mode"]
+    plain = {**options, "vectorization_mode": "sync"}
+    assert default == gym.make_vec("PlowSandFast-v0", **plain).metadata["autoreset_mode"]
+    for env in (batch, theirs):
+        env.reset(seed=1)
+    for k in range(5):
+        actions = np.full((2, 1), 0.3 * k - 0.5, np.float32)
+        (mine, *my_rest, my_info), (other, *rest, info) = batch.step(actions), theirs.step(actions)
+        assert all(np.array_equal(mine[key], other[key]) for key in other)
+        assert all(np.array_equal(a, b) for a, b in zip(my_rest, rest, strict=True))
+        assert my_info.keys() == info.keys()
 
 
 @pytest.mark.slow
