@@ -1,0 +1,102 @@
+"""Each kind of container, from photographs to a friction angle: the table in docs/scenes.md.
+
+``splatsoil benchmark scenes --page docs/scenes.md`` makes a set of each kind, of one surface and seed, and runs
+``splatsoil run SET --no-effects`` on it. Sets and runs are kept in the folder, and a second call continues from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from splatsoil.benchmarks._common import Clock, markdown, parser_of, stamp, tell, with_section
+
+from splatsoil.errors import RunError
+from splatsoil.files import read_json, write_text
+from splatsoil.measurement import CONTAINERS
+from splatsoil.mpm import PRESETS
+from splatsoil.quiet import hush
+from splatsoil.reconstruction import Reconstruction
+from splatsoil.report.text import no_answer
+from splatsoil.run_files import read_fit
+from splatsoil.synthetic import Recipe, Setup, make_set, plow
+
+ANGLE, SEED, VIEWS, PICTURE_SCALE = 33.0, 3, 16, 0.5
+"""Of the soil, degrees; of surface, looks and noise; photographs; their size over that of the scene."""
+
+
+def scene(container: str) -> Setup:
+    """The experiment in a container of that kind."""
+    return plow(SEED, views=VIEWS, container=container).resized(PICTURE_SCALE)
+
+
+def found(run: Path, container: str) -> dict[str, Any]:
+    """What a run of a set of that kind found, against the truth: dB, mm, degrees."""
+    made, fit = Reconstruction.load(run / "reconstruction"), read_fit(run)
+    off = 1e3 * made.surface.difference(scene(container).surface)
+    angle, misfit = fit["parameters"]["friction_angle"], read_json(run / "comparison" / "misfit.json")
+    return {
+        "container": container,
+        "psnr": made.psnr,
+        "surface": float(np.sqrt(np.nanmean(off**2))),
+        "surface_median": float(np.nanmedian(np.abs(off))),
+        "estimate": angle["estimate"],
+        "std": angle["std"],
+        "adequate": bool(misfit["adequate"]),
+        "no_answer": no_answer(fit),
+    }
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Markdown."""
+    head = ("set", "photographs set aside", "surface, root mean square; median", f"angle ({ANGLE:g}°)", "model")
+    cells = [
+        (
+            f"`{row['container']}`",
+            f"{row['psnr']:.1f} dB",
+            f"{row['surface']:.1f}; {row['surface_median']:.1f} mm",
+            row["no_answer"] or f"{row['estimate']:.1f} ± {row['std']:.1f}°",
+            "adequate" if row["adequate"] else "not adequate",
+        )
+        for row in rows
+    ]
+    return markdown(head, cells)
+
+
+def answered(container: str, preset: str, device: str, out: Path) -> Path:
+    """The run of a set of that kind, which is made, and run, where the folder lacks it.
+
+    Raises:
+        RunError: the command ended without a comparison of models.
+    """
+    from splatsoil.cli import main as command_line
+
+    place, run = out / "sets" / container, out / "runs" / container
+    if not (place / "truth.json").is_file():
+        make_set(place, scene(container), Recipe(ANGLE, preset=preset, seed=SEED, device=device))
+    if not (run / "comparison" / "misfit.json").is_file():
+        words = ["run", str(place), "--run", str(run), "--preset", preset, "--device", device, "--no-effects"]
+        code = command_line(words)
+        if not (run / "comparison" / "misfit.json").is_file():
+            raise RunError(f"{run}: ended with exit code {code} before the comparison of models")
+    return run
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Make, run, print the table, and write it into a page; exit code 0."""
+    parser = parser_of(__doc__, "runs/scenes", page=True)
+    parser.add_argument("--preset", default="tiny", choices=sorted(PRESETS))
+    options = parser.parse_args(arguments)
+    hush()
+    mark, say, rows = f"scenes {options.preset}", Clock(), []
+    if options.page:
+        with_section(options.page, mark, "")  # a page without a place for the table fails now, not at the end
+    for container in CONTAINERS:
+        say(container)
+        rows.append(found(answered(container, options.preset, options.device, options.out), container))
+    if options.page:
+        write_text(options.page, with_section(options.page, mark, table(rows)))
+    tell(options, {"made_by": stamp(options.device), "preset": options.preset, "rows": rows}, table(rows))
+    return 0
