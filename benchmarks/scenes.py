@@ -2,6 +2,7 @@
 
 ``splatsoil benchmark scenes --page docs/scenes.md`` makes a set of each kind, of one surface and seed, and runs
 ``splatsoil run SET --no-effects`` on it. Sets and runs are kept in the folder, and a second call continues from there.
+With ``--published SET``, a set of the published scene is reconstructed, and its surface compared with the formula.
 """
 
 from __future__ import annotations
@@ -12,19 +13,26 @@ from typing import Any
 
 import numpy as np
 from splatsoil.benchmarks._common import Clock, markdown, parser_of, stamp, tell, with_section
+from splatsoil.envs.measured import reconstructed
 
 from splatsoil.errors import RunError
 from splatsoil.files import read_json, write_text
-from splatsoil.measurement import CONTAINERS
+from splatsoil.measurement import CONTAINERS, Measurement
 from splatsoil.mpm import PRESETS
 from splatsoil.quiet import hush
 from splatsoil.reconstruction import Reconstruction
 from splatsoil.report.text import no_answer
 from splatsoil.run_files import read_fit
-from splatsoil.synthetic import Recipe, Setup, make_set, plow
+from splatsoil.synthetic import Recipe, Setup, make_set, paper, plow
 
 ANGLE, SEED, VIEWS, PICTURE_SCALE = 33.0, 3, 16, 0.5
 """Of the soil, degrees; of surface, looks and noise; photographs; their size over that of the scene."""
+
+
+def off(made: Reconstruction, setup: Setup) -> tuple[float, float]:
+    """Root mean square and median of the surface's error, mm."""
+    error = 1e3 * made.surface.difference(setup.surface)
+    return float(np.sqrt(np.nanmean(error**2))), float(np.nanmedian(np.abs(error)))
 
 
 def scene(container: str) -> Setup:
@@ -35,13 +43,13 @@ def scene(container: str) -> Setup:
 def found(run: Path, container: str) -> dict[str, Any]:
     """What a run of a set of that kind found, against the truth: dB, mm, degrees."""
     made, fit = Reconstruction.load(run / "reconstruction"), read_fit(run)
-    off = 1e3 * made.surface.difference(scene(container).surface)
+    surface, median = off(made, scene(container))
     angle, misfit = fit["parameters"]["friction_angle"], read_json(run / "comparison" / "misfit.json")
     return {
         "container": container,
         "psnr": made.psnr,
-        "surface": float(np.sqrt(np.nanmean(off**2))),
-        "surface_median": float(np.nanmedian(np.abs(off))),
+        "surface": surface,
+        "surface_median": median,
         "estimate": angle["estimate"],
         "std": angle["std"],
         "adequate": bool(misfit["adequate"]),
@@ -84,19 +92,47 @@ def answered(container: str, preset: str, device: str, out: Path) -> Path:
     return run
 
 
+def published(place: Path, preset: str, device: str, out: Path) -> dict[str, Any]:
+    """What a reconstruction of the published scene has, against its formula: dB, mm."""
+    made = reconstructed(Measurement.load(place), out / f"published-{preset}", preset, device)
+    surface, median = off(made, paper())
+    decibels = [view.psnr for view in made.held_out]
+    return {
+        "preset": preset,
+        "psnr": made.psnr,
+        "least": min(decibels),
+        "most": max(decibels),
+        "threshold": float(np.mean([view.displaced for view in made.held_out])),
+        "surface": surface,
+        "surface_median": median,
+    }
+
+
+def table_of_published(row: Mapping[str, Any]) -> str:
+    """Markdown."""
+    head = ("preset", "photographs set aside", "threshold", "surface, root mean square; median")
+    decibels = f"{row['psnr']:.1f} dB ({row['least']:.1f} to {row['most']:.1f})"
+    cells = (f"`{row['preset']}`", decibels, f"{row['threshold']:.1f} dB")
+    return markdown(head, [(*cells, f"{row['surface']:.1f}; {row['surface_median']:.1f} mm")])
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make, run, print the table, and write it into a page; exit code 0."""
     parser = parser_of(__doc__, "runs/scenes", page=True)
     parser.add_argument("--preset", default="tiny", choices=sorted(PRESETS))
+    parser.add_argument("--published", type=Path, metavar="SET", help="a set of the published scene")
     options = parser.parse_args(arguments)
     hush()
-    mark, say, rows = f"scenes {options.preset}", Clock(), []
+    mark, say, rows = f"{'published' if options.published else 'scenes'} {options.preset}", Clock(), []
     if options.page:
         with_section(options.page, mark, "")  # a page without a place for the table fails now, not at the end
-    for container in CONTAINERS:
+    if options.published:
+        rows.append(published(options.published, options.preset, options.device, options.out))
+    for container in () if options.published else CONTAINERS:
         say(container)
         rows.append(found(answered(container, options.preset, options.device, options.out), container))
+    text = table_of_published(rows[0]) if options.published else table(rows)
     if options.page:
-        write_text(options.page, with_section(options.page, mark, table(rows)))
-    tell(options, {"made_by": stamp(options.device), "preset": options.preset, "rows": rows}, table(rows))
+        write_text(options.page, with_section(options.page, mark, text))
+    tell(options, {"made_by": stamp(options.device), "preset": options.preset, "rows": rows}, text)
     return 0

@@ -16,6 +16,7 @@ from splatsoil.errors import RunError
 from splatsoil.files import write_json
 from splatsoil.reconstruction import Reconstruction
 from splatsoil.reconstruction.pipeline import no_gaussians
+from splatsoil.reconstruction.result import HeldOut
 from splatsoil.reconstruction.surface import soil_mesh
 
 
@@ -62,3 +63,16 @@ def test_what_is_there_is_not_made_again(tmp_path: Path, monkeypatch: pytest.Mon
     makes = False
     with pytest.raises(RunError, match="exit code 2 before"):
         scenes.answered("bin", "tiny", "cpu", tmp_path)
+
+
+def test_the_published_scene_is_held_against_its_formula(
+    small_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    setup, none = scenes.paper(), torch.zeros(0, dtype=torch.bool)
+    surface = replace(setup.surface, height=setup.surface.height - 0.003)
+    aside = tuple(HeldOut("a.jpg", psnr, 0.9, 25.0) for psnr in (30.0, 34.0))
+    black = (0.0, 0.0, 0.0)
+    made = Reconstruction(no_gaussians(), none, none, surface, soil_mesh(surface, setup.bed), black, aside)
+    monkeypatch.setattr(scenes, "reconstructed", lambda *_: made)
+    text = scenes.table_of_published(scenes.published(small_set, "tiny", "cpu", tmp_path))
+    assert "| `tiny` | 32.0 dB (30.0 to 34.0) | 25.0 dB | 3.0; 3.0 mm |" in text
