@@ -95,9 +95,9 @@ def checks(
     measured = experiment.observed[mask]
     predicted = measured - residual[mask]
     found = []
-    for (key, index), ratio, value in zip(blocks.items(), np.sqrt(own), adjusted, strict=True):
+    for ((stage, region, channel), index), ratio, value in zip(blocks.items(), np.sqrt(own), adjusted, strict=True):
         amplitude = np.linalg.norm(predicted[index]) / max(np.linalg.norm(measured[index]), 1e-12)
-        found.append(Check(*key, float(ratio), float(value), len(index), float(amplitude)))
+        found.append(Check(stage, region, channel, float(ratio), float(value), len(index), float(amplitude)))
     return sorted(found, key=lambda c: (c.p, -c.ratio))
 
 
