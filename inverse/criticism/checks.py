@@ -96,7 +96,7 @@ def checks(
     predicted = measured - residual[mask]
     found = []
     for ((stage, region, channel), index), ratio, value in zip(blocks.items(), np.sqrt(own), adjusted, strict=True):
-        amplitude = np.linalg.norm(predicted[index]) / max(np.linalg.norm(measured[index]), 1e-12)
+        amplitude = np.linalg.norm(predicted[index]) / np.maximum(np.linalg.norm(measured[index]), 1e-12)
         found.append(Check(stage, region, channel, float(ratio), float(value), len(index), float(amplitude)))
     return sorted(found, key=lambda c: (c.p, -c.ratio))
 
