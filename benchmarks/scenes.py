@@ -7,6 +7,8 @@ With ``--published SET``, a set of the published scene is reconstructed, and its
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -79,14 +81,12 @@ def answered(container: str, preset: str, device: str, out: Path) -> Path:
     Raises:
         RunError: the command ended without a comparison of models.
     """
-    from splatsoil.cli import main as command_line
-
     place, run = out / "sets" / container, out / "runs" / container
     if not (place / "truth.json").is_file():
         make_set(place, scene(container), Recipe(ANGLE, preset=preset, seed=SEED, device=device))
     if not (run / "comparison" / "misfit.json").is_file():
         words = ["run", str(place), "--run", str(run), "--preset", preset, "--device", device, "--no-effects"]
-        code = command_line(words)
+        code = subprocess.run([sys.executable, "-m", "splatsoil", *words], stdout=sys.stderr, check=False).returncode
         if not (run / "comparison" / "misfit.json").is_file():
             raise RunError(f"{run}: ended with exit code {code} before the comparison of models")
     return run

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -49,14 +50,14 @@ def test_what_is_there_is_not_made_again(tmp_path: Path, monkeypatch: pytest.Mon
         asked.append("set")
         write_json(place / "truth.json", {})
 
-    def command(words: list[str]) -> int:
-        asked.append(words[0])
+    def command(words: list[str], **_: object) -> SimpleNamespace:
+        asked.append(words[3])
         if makes:
-            write_json(Path(words[3]) / "comparison" / "misfit.json", {})
-        return 2
+            write_json(Path(words[words.index("--run") + 1]) / "comparison" / "misfit.json", {})
+        return SimpleNamespace(returncode=2)
 
     monkeypatch.setattr(scenes, "make_set", make_set)
-    monkeypatch.setattr("splatsoil.cli.main", command)
+    monkeypatch.setattr("subprocess.run", command)
     for _ in range(2):
         assert scenes.answered("heap", "tiny", "cpu", tmp_path) == tmp_path / "runs" / "heap"
     assert asked == ["set", "run"]
