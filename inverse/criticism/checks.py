@@ -29,6 +29,7 @@ class Check:
         ratio: root mean square of the residual over its expectation.
         p: adjusted p-value.
         n: number of features.
+        amplitude: root mean square of the prediction over that of the measurement.
     """
 
     stage: str
@@ -37,6 +38,7 @@ class Check:
     ratio: float
     p: float
     n: int
+    amplitude: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +92,12 @@ def checks(
     p = (1.0 + np.sum(replicates >= own, axis=0)) / (1.0 + REPLICATES)
     order, adjusted = np.argsort(p), np.ones(len(p))
     adjusted[order] = np.minimum(np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)), 1.0)
-    found = [
-        Check(stage, region, channel, float(ratio), float(value), len(index))
-        for ((stage, region, channel), index), ratio, value in zip(blocks.items(), np.sqrt(own), adjusted, strict=True)
-    ]
+    measured = experiment.observed[mask]
+    predicted = measured - residual[mask]
+    found = []
+    for ((stage, region, channel), index), ratio, value in zip(blocks.items(), np.sqrt(own), adjusted, strict=True):
+        amplitude = np.linalg.norm(predicted[index]) / np.maximum(np.linalg.norm(measured[index]), 1e-12)
+        found.append(Check(stage, region, channel, float(ratio), float(value), len(index), float(amplitude)))
     return sorted(found, key=lambda c: (c.p, -c.ratio))
 
 

@@ -113,7 +113,8 @@ def sentences(diagnosis: Diagnosis, candidates: Mapping[str, Candidate]) -> list
     if worst is not None:
         out.append(
             f"The most probable model fails most clearly here: {worst.region}, {worst.stage}, {worst.channel}, with "
-            f"{worst.ratio:.1f} times the expected residual."
+            f"{worst.ratio:.1f} times the expected residual. The prediction there is {100.0 * worst.amplitude:.0f} %"
+            " of the measurement (root mean squares)."
         )
     if candidates:
         out += _power(diagnosis, candidates)

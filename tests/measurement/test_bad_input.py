@@ -278,6 +278,8 @@ CASES: dict[str, tuple[Spoil, str, str | None, str]] = {
     "depth-of-another-size": (depth("d.npy", np.ones((320, 240))), "views/d.npy", DEPTH, "(240, 320)"),
     "depth-of-a-tenth-of-a-millimetre": (depth("d.png", np.full((240, 320), 9000, np.uint16)), "views/d.png", DEPTH,
         "one of the bed"),
+    "depth-scale-not-in-metres": (both(depth("d.png", np.full((240, 320), 900, np.uint16)),
+        view(1, "integer_depth_scale", 1000.0)), VIEWS, "frames[1].integer_depth_scale", "it is in metres"),
     "depth-of-no-type": (both(replace("views/d.exr", b"v/1\x01"), view(1, "depth_file_path", "d.exr")), "views/d.exr",
         DEPTH, "save a .npy or a TIFF"),
     "mask-of-floats": (both(lambda f: RAMP.save(f / "views/m.tif"), view(1, "mask_path", "m.tif")), "views/m.tif",

@@ -176,6 +176,8 @@ def test_checks_find_a_block_that_is_off_and_hardly_ever_one_that_is_not(make: M
     found = checks(experiment, residual, expected, mask)
     assert not passes(found)
     assert (found[0].stage, found[0].channel) == ("withdrawal", "left") and found[0].ratio > 2.0
+    weak = checks(experiment, 0.4 * experiment.observed, expected, mask)
+    assert [check.amplitude for check in weak] == pytest.approx([0.6] * len(weak))
 
 
 def test_a_size_that_is_called_detectable_is_found_and_noise_hides_more(make: Make) -> None:
