@@ -38,6 +38,7 @@ NEUTRAL = {
     "envs/__init__.py": "the names of environments",
     "envs/devices.py": "the device, which each key has by itself",
     "envs/problem.py": "what an evaluation is",
+    "quiet.py": "what libraries print",
 }
 
 
