@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from splatsoil.envs.devices import resolve_device
 
 from splatsoil import __version__
+from splatsoil.devices import resolve_device
 from splatsoil.errors import ParameterError, RunError
 from splatsoil.files import code_digest, plain, read_json, write_bytes, write_json, write_text
 from splatsoil.parameters import Parameter

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from splatsoil.devices import resolve_device
 from splatsoil.parameters import ParameterSpace
 from splatsoil.quiet import hush
 
-from .devices import resolve_device
 from .problem import Evaluation, FloatArray, Image
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from splatsoil.devices import resolve_device
 from splatsoil.errors import ParameterError
 
-from .devices import resolve_device
 from .emulator import STRENGTHS, STROKES, FloatArray, evidence, sobol, soil_of, stroke_at, surfaces
 from .episode import Array, EpisodeEnv
 from .synthetic_experiment import SyntheticExperiment

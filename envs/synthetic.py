@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
+from splatsoil.devices import resolve_device
 from splatsoil.errors import ParameterError, SimulationError
 from splatsoil.parameters import ParameterSpace
 
-from .devices import resolve_device
 from .problem import Evaluation, Image
 from .synthetic_experiment import COMPARED, HEIGHT, WIDTH, SyntheticExperiment
 

@@ -36,7 +36,7 @@ NEUTRAL = {
     "run_files.py": "what kept files are called, and must hold",
     "threads.py": "how many work at once",
     "envs/__init__.py": "the names of environments",
-    "envs/devices.py": "the device, which each key has by itself",
+    "devices.py": "the device, which each key has by itself",
     "envs/problem.py": "what an evaluation is",
     "quiet.py": "what libraries print",
 }

@@ -9,7 +9,7 @@ from typing import Any
 
 from splatsoil.commands._options import FitOptions
 from splatsoil.commands._output import print_result, stages
-from splatsoil.envs.devices import resolve_device
+from splatsoil.devices import resolve_device
 from splatsoil.errors import MeasurementError, RunError
 from splatsoil.files import check_folder, plain, write_json
 from splatsoil.quiet import hush

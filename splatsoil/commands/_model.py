@@ -16,7 +16,7 @@ import numpy as np
 from splatsoil import __version__
 from splatsoil.commands._options import FitOptions, RunOptions, command_line, same_again
 from splatsoil.commands._output import Report, Stage, places, print_remarks, stages
-from splatsoil.envs.devices import resolve_device
+from splatsoil.devices import resolve_device
 from splatsoil.errors import MeasurementError, NoAnswer, ParameterError, RunError, SetWarning
 from splatsoil.files import CRITICISM, FORWARD, RECONSTRUCTING, code_digest, code_of, digest, own_files
 from splatsoil.inverse.run_folder import RunFolder

@@ -18,7 +18,7 @@ from splatsoil.commands._model import ModelSpec, experiment_of, reconstruction_d
 from splatsoil.commands._options import EVALUATIONS, FitOptions, check_evaluations, check_seed
 from splatsoil.commands._output import Report, Stage, by_frame, print_remarks
 from splatsoil.commands._resources import COMPARISON, check_memory, check_time, needs
-from splatsoil.envs.devices import resolve_device
+from splatsoil.devices import resolve_device
 from splatsoil.errors import MeasurementError, ParameterError, RunError
 from splatsoil.files import CRITICISM, code_digest, code_of, plain, write_bytes, write_json
 from splatsoil.inverse.evaluations import EvaluationStore

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from splatsoil import threads
 from splatsoil.commands._resources import gpu_memory, memory
-from splatsoil.envs.devices import resolve_device
+from splatsoil.devices import resolve_device
 from splatsoil.errors import SetWarning, SplatsoilError
 from splatsoil.inverse import executors
 from splatsoil.inverse.run_folder import RunFolder

@@ -10,7 +10,7 @@ from splatsoil import __version__
 from splatsoil.commands import _model, _stages, _workers
 from splatsoil.commands._options import ComputingOptions, check_seed, command_line
 from splatsoil.commands._output import print_parameters, print_result, stages
-from splatsoil.envs.devices import resolve_device
+from splatsoil.devices import resolve_device
 from splatsoil.errors import ParameterError
 from splatsoil.files import code_of
 from splatsoil.options import option

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from splatsoil.commands import _model
 from splatsoil.commands._options import PRESET, SEED, SET, Preset, check_seed
 from splatsoil.commands._output import print_remarks, print_result, print_table, print_text, stages
-from splatsoil.envs.devices import resolve_device
+from splatsoil.devices import resolve_device
 from splatsoil.files import check_folder
 from splatsoil.options import JSON, argument, option
 from splatsoil.quiet import hush

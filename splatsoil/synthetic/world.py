@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from splatsoil import __version__
+from splatsoil.devices import resolve_device
 from splatsoil.errors import ParameterError
 from splatsoil.files import check_folder
 from splatsoil.measurement import Contents, Measurement, write_measurement
@@ -94,7 +94,7 @@ def make_set(out: str | Path, setup: Setup, recipe: Recipe, progress: Report = l
     """
     target, seed, particle_seed = Path(out), recipe.seed, recipe.particle_seed
     check_place(target)
-    device = check_device(recipe.device)
+    device = resolve_device(recipe.device)
     if seed < 0 or (particle_seed is not None and particle_seed < 0):
         raise ParameterError(f"seeds are whole numbers from 0 on, not {seed if seed < 0 else particle_seed}")
     experiment = setup.experiment()
@@ -192,18 +192,6 @@ def check_place(target: Path) -> None:
     if (target.is_dir() and any(target.iterdir())) or (target.exists() and not target.is_dir()):
         raise ParameterError(f"{target}: already there and not an empty folder; nothing is overwritten")
     check_folder(target)
-
-
-def check_device(device: str) -> str:
-    """A device that is there; ``auto`` is the first CUDA device or else the CPU."""
-    wp.config.quiet = True
-    wp.init()
-    cuda = [str(d) for d in wp.get_cuda_devices()]
-    if device == "auto":
-        return cuda[0] if cuda else "cpu"
-    if device not in ("cpu", *cuda):
-        raise ParameterError(f"device {device!r} is not here; there are {', '.join(['auto', 'cpu', *cuda])}")
-    return device
 
 
 def truth_frames(frames: tuple[int, ...]) -> tuple[int, ...]:
