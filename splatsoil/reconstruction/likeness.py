@@ -40,68 +40,59 @@ class Likeness:
         return (self.correlation[-fixed:] <= by_chance) & valid
 
 
-def likeness(
-    gaussians: Gaussians, views: Views, usable: torch.Tensor, bed: Bed, level: float, background: tuple[float, ...]
-) -> Likeness:
-    """Correlation of each picture with the scene.
+@dataclass(frozen=True)
+class Pictures:
+    """Pictures beside what is drawn of a scene.
 
-    Args:
+    Attributes:
         gaussians: the scene, on the device where it is to be drawn.
         views: the pictures.
         usable: (v, h, w) 1 where they may be used.
         bed: the box that holds the soil.
-        level: height of the soil, metres.
+        level: height of the soil, m.
         background: sRGB colour behind all Gaussians.
     """
-    out = []
-    for k in range(len(views.cameras)):
-        ours, theirs, seen = _pictures(gaussians, views, usable, bed, level, background, k)
-        out.append((_correlation(ours, theirs, seen), _correlation(ours[::-1, ::-1], theirs, seen & seen[::-1, ::-1])))
-    return Likeness(*np.array(out).reshape(-1, 2).T)
 
+    gaussians: Gaussians
+    views: Views
+    usable: torch.Tensor
+    bed: Bed
+    level: float
+    background: tuple[float, ...]
 
-def displacements(
-    gaussians: Gaussians,
-    views: Views,
-    usable: torch.Tensor,
-    bed: Bed,
-    level: float,
-    background: tuple[float, ...],
-    fixed: int,
-) -> FloatArray:
-    """Displacement (fixed,) of the soil in the last pictures from where the scene is drawn: root mean square over its
-    pixels, px; NaN where there is no soil. The other arguments are those of `likeness`."""
-    last = range(len(views.cameras) - fixed, len(views.cameras))
-    return np.array([_displacement(*_pictures(gaussians, views, usable, bed, level, background, k)) for k in last])
+    def likeness(self) -> Likeness:
+        """Correlation of each picture with the scene."""
+        out = []
+        for ours, theirs, seen in map(self._soil, range(len(self.views.cameras))):
+            turned = _correlation(ours[::-1, ::-1], theirs, seen & seen[::-1, ::-1])
+            out.append((_correlation(ours, theirs, seen), turned))
+        return Likeness(*np.array(out).reshape(-1, 2).T)
 
+    def displacements(self, fixed: int) -> FloatArray:
+        """Displacement (fixed,) of the soil in the last pictures from where it is drawn: root mean square over its
+        pixels, px; NaN where there is no soil."""
+        last = len(self.views.cameras)
+        return np.array([_displacement(*self._soil(k)) for k in range(last - fixed, last)])
 
-def _pictures(
-    gaussians: Gaussians,
-    views: Views,
-    usable: torch.Tensor,
-    bed: Bed,
-    level: float,
-    background: tuple[float, ...],
-    k: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], BoolArray]:
-    """Of a picture the box (h, w) around its soil: grey levels as drawn, as observed, and which pixels show soil."""
-    camera = views.cameras[k]
-    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    origin, ray = camera.rays(np.stack([columns, rows], axis=-1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        away = (level - origin[:, 2]) / ray[:, 2]
-        place = (origin + away[:, None] * ray)[:, :2]
-        soil = (away > 0.0) & (bed.beyond(place) < 0.0)
-    seen = soil.reshape(camera.height, camera.width)
-    seen = seen & (usable[k, : camera.height, : camera.width] > 0.0).cpu().numpy()
-    if not seen.any():
-        none = np.zeros((0, 0))
-        return none, none, none.astype(bool)
-    with torch.no_grad():
-        drawn = rasterise(gaussians, camera, background=background, antialias=True).colour
-    box = tuple(slice(where.min(), where.max() + 1) for where in np.nonzero(seen))
-    ours, theirs = (p.mean(dim=2).cpu().numpy()[box].astype(np.float64) for p in (drawn, views.photograph(k)))
-    return ours, theirs, seen[box]
+    def _soil(self, k: int) -> tuple[NDArray[np.float64], NDArray[np.float64], BoolArray]:
+        """Of a picture the box (h, w) around its soil: grey levels as drawn, as observed; which pixels show soil."""
+        camera = self.views.cameras[k]
+        columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        origin, ray = camera.rays(np.stack([columns, rows], axis=-1))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            away = (self.level - origin[:, 2]) / ray[:, 2]
+            place = (origin + away[:, None] * ray)[:, :2]
+            soil = (away > 0.0) & (self.bed.beyond(place) < 0.0)
+        seen = soil.reshape(camera.height, camera.width)
+        seen = seen & (self.usable[k, : camera.height, : camera.width] > 0.0).cpu().numpy()
+        if not seen.any():
+            none = np.zeros((0, 0))
+            return none, none, none.astype(bool)
+        with torch.no_grad():
+            drawn = rasterise(self.gaussians, camera, background=self.background, antialias=True).colour
+        box = tuple(slice(where.min(), where.max() + 1) for where in np.nonzero(seen))
+        ours, theirs = (p.mean(dim=2).cpu().numpy()[box].astype(np.float64) for p in (drawn, self.views.photograph(k)))
+        return ours, theirs, seen[box]
 
 
 def _displacement(drawn: NDArray[np.float64], photograph: NDArray[np.float64], seen: BoolArray) -> float:

@@ -20,7 +20,7 @@ from splatsoil.reconstruction.height_field import HeightField
 from splatsoil.reconstruction.heights import first_surface
 from splatsoil.reconstruction.hidden import reaching_into_soil
 from splatsoil.reconstruction.initial import SIDE, TOOL, first_gaussians
-from splatsoil.reconstruction.likeness import displacements, likeness
+from splatsoil.reconstruction.likeness import Pictures
 from splatsoil.reconstruction.presets import preset_named
 from splatsoil.reconstruction.result import HeldOut, Reconstruction
 from splatsoil.reconstruction.sides import sides_seen
@@ -123,7 +123,7 @@ def reconstruct(
     if cameras:
         # Before training, which bends the scene to what it is shown.
         level = float(np.median(geometry.surface.height))
-        alike = likeness(first, views, geometry.usable, bed, level, NO_BACKGROUND)
+        alike = Pictures(first, views, geometry.usable, bed, level, NO_BACKGROUND).likeness()
         usual = np.nanmedian(alike.correlation[: -len(cameras)])
         for k in np.flatnonzero(alike.unrelated(len(cameras))):
             value = alike.correlation[k - len(cameras)]
@@ -151,11 +151,11 @@ def reconstruct(
     if cameras:
         report("comparing with the video", 0.0)
         level = float(np.median(surface.height))
-        apart = displacements(scene, views, geometry.usable, bed, level, trained.background, len(cameras))
+        shown = Pictures(scene, views, geometry.usable, bed, level, trained.background)
         remarks += [
             f"video: The bed that camera {camera!r} sees is displaced by {value:.1f} px from that in the views; are"
             " their poses and lenses of one world and scale, and is the bed the same?"
-            for camera, value in zip(cameras, apart, strict=True)
+            for camera, value in zip(cameras, shown.displacements(len(cameras)), strict=True)
             if value > RESOLVED
         ]
     cell = Resolution.derive(measurement, preset).cell

@@ -16,7 +16,7 @@ from splatsoil.measurement import Contents, Measurement, Picture, write_measurem
 from splatsoil.reconstruction import HeightField, Reconstruction, reconstruct
 from splatsoil.reconstruction.hidden import reaching_into_soil
 from splatsoil.reconstruction.initial import SOIL, Seeds, discs
-from splatsoil.reconstruction.likeness import Likeness, displacements, likeness
+from splatsoil.reconstruction.likeness import Likeness, Pictures
 from splatsoil.reconstruction.pipeline import judged
 from splatsoil.reconstruction.surface import surface_through
 from splatsoil.reconstruction.views import load_views
@@ -172,7 +172,7 @@ def alike(measurement, result, change=lambda images: images, bed=None):
     views = load_views(measurement.views[:4], 160)
     shown = replace(views, images=change(views.images))
     level = float(np.median(result.surface.height))
-    return likeness(result.gaussians, shown, views.valid, bed or measurement.bed, level, result.background)
+    return Pictures(result.gaussians, shown, views.valid, bed or measurement.bed, level, result.background).likeness()
 
 
 def test_likeness_is_of_the_soil_and_whatever_the_exposure(measurement, result):
@@ -198,7 +198,8 @@ def test_displacements_are_found_whatever_a_wall_hides_and_however_light_it_is(m
             images[:, :, -images.shape[2] // share :] = 1.0
         level = float(np.median(result.surface.height))
         shown = replace(views, images=images)
-        return displacements(result.gaussians, shown, views.valid, measurement.bed, level, result.background, 3)
+        pictures = Pictures(result.gaussians, shown, views.valid, measurement.bed, level, result.background)
+        return pictures.displacements(3)
 
     np.testing.assert_array_less(displaced((0, 0)), 0.5)
     np.testing.assert_allclose(displaced((0, 3)), 3.0, atol=0.5)
